@@ -1,0 +1,35 @@
+"""Experiments in 3D vision-language Gaussian splatting.
+
+The public functions are loaded on first use, so that `import vlgs` costs nothing and entry points that need no tensors
+never import torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vlgs.render import rasterize as rasterize
+    from vlgs.types import Camera as Camera
+    from vlgs.types import ChannelGroup as ChannelGroup
+    from vlgs.types import RasterConfig as RasterConfig
+    from vlgs.types import Rendered as Rendered
+    from vlgs.types import Scene as Scene
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "rasterize": "vlgs.render",
+    "Camera": "vlgs.types",
+    "ChannelGroup": "vlgs.types",
+    "RasterConfig": "vlgs.types",
+    "Rendered": "vlgs.types",
+    "Scene": "vlgs.types",
+}
+
+__all__ = ["Camera", "ChannelGroup", "RasterConfig", "Rendered", "Scene", "rasterize"]  # noqa: F822
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'vlgs' has no attribute {name!r}")

@@ -1,0 +1,172 @@
+"""Values that cross module borders: frozen dataclasses, no behaviour.
+
+Conventions, here and nowhere else:
+
+* Camera axes are OpenCV's: x right, y down, z forward. `viewmat` maps world to camera: ``x_cam = R x + t``.
+* Quaternions are ``(w, x, y, z)`` and need not be normalised.
+* Pixel centres are at +0.5: the middle of the top-left pixel is ``(0.5, 0.5)``. `K` holds COLMAP's principal point as is.
+* Images are ``[height, width, channels]``. Colours are in [0, 1] as floats and in [0, 255] as uint8 storage.
+* The background is black for colour and zero for language.
+* Shape letters: n Gaussians, h w pixels, c channels, d language code width, e embedding width (512 for CLIP), k classes.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; lenses with distortion are undistorted when a scene is read."""
+
+    viewmat: Float[Tensor, "4 4"]
+    """World to camera."""
+    K: Float[Tensor, "3 3"]
+    """fx, fy, cx, cy in pixels of this camera's own width and height."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class ObjectLabels:
+    """Labelled objects of one view, as LERF-OVS has them: what is not labelled is unknown, not background."""
+
+    masks: Mapping[str, Bool[Tensor, "h w"]]
+    """Category -> union of its instances."""
+    boxes: Mapping[str, Float[Tensor, "b 4"]]
+    """Category -> one ``(x1, y1, x2, y2)`` per instance, in pixels, edges inclusive."""
+
+
+@dataclass(frozen=True)
+class DenseLabels:
+    """A class id for every pixel of one view."""
+
+    ids: UInt8[Tensor, "h w"]
+    """Index into `Scene.classes`, or `IGNORE_ID`."""
+
+
+IGNORE_ID = 255
+"""Pixels with this class id take no part in any score."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph. Pixels stay on disk until a `read_*` is called; each reader returns the same values every time."""
+
+    name: str
+    """File stem; labels and language maps are matched by it, never by position."""
+    camera: Camera
+    read_image: Callable[[], UInt8[Tensor, "h w 3"]]
+    read_masks: Callable[[], Int[Tensor, "h w"]] | None = None
+    """Language supervision: row of `Scene.mask_vectors` per pixel, -1 where no mask lies (int32)."""
+    read_object_labels: Callable[[], ObjectLabels] | None = None
+    read_dense_labels: Callable[[], DenseLabels] | None = None
+    read_valid: Callable[[], Bool[Tensor, "h w"]] | None = None
+    """Pixels that the photograph covers; None where it covers all (undistortion leaves borders)."""
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Words and their text embeddings, one embedding space."""
+
+    names: tuple[str, ...]
+    vectors: Float[Tensor, "k e"]
+    """Unit length, row i belongs to names[i]."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that training and evaluation need from the outside world."""
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    """Held-out views; no view is in both unless the split says so."""
+    split: str
+    """How train and test were told apart, as it stands in the protocol name: ``llff8``, ``list``, ``all``, ``synthetic``."""
+    points: Float[Tensor, "p 3"]
+    """Sparse points in world units; may be empty."""
+    point_colors: UInt8[Tensor, "p 3"]
+    mask_vectors: Float[Tensor, "m e"]
+    """Unit image-text embedding of every mask of every training view at the chosen level; m = 0 without language."""
+    mask_areas: Float[Tensor, " m"]
+    """Pixels that each row of `mask_vectors` covers over all training views."""
+    classes: tuple[str, ...] = ()
+    """What can be asked for: names of dense class ids, or the categories of the object labels."""
+    class_kinds: Mapping[str, str] = field(default_factory=dict)
+    """Category -> ``translucent_reflective`` or ``other``, where it is known."""
+    vocabulary: Vocabulary | None = None
+    fingerprint: str = ""
+    """Content hash of all that was read; two scenes with one fingerprint give one result."""
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Activated Gaussians: what is differentiated, in natural units."""
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the principal axes, world units, > 0."""
+    opacities: Float[Tensor, " n"]
+    """Colour opacity o in [0, 1]."""
+    indicators: Float[Tensor, " n"]
+    """Semantic indicator l in [0, 1] (Eq. lancity)."""
+    sh0: Float[Tensor, "n 3"]
+    """Degree-0 spherical harmonics coefficient; RGB = 0.5 + 0.28209479 * sh0."""
+    shN: Float[Tensor, "n s 3"]  # noqa: N815 (gsplat's name)
+    """Coefficients of degrees 1 to 3; s is 0, 3, 8 or 15."""
+    features: Float[Tensor, "n d"]
+    """Language code f."""
+
+
+@dataclass(frozen=True)
+class ChannelGroup:
+    """Channels that are blended with one weight per Gaussian and one transmittance per pixel (Eqs. rgb-render, lancity)."""
+
+    values: Float[Tensor, "n c"]
+    """What is blended: colour, language code, ids, CLIP vectors; any c >= 1."""
+    weight: Float[Tensor, " n"]
+    """Opacity, indicator, ...; in [0, 1]. Groups that share this very tensor share one transmittance chain."""
+    shape_grad: bool = True
+    """Whether this group's gradient reaches means, quats and scales (systems differ: Feature-3DGS as released says no)."""
+
+
+@dataclass(frozen=True)
+class RasterConfig:
+    """Every constant of the rasterizer, used by the kernel and by the reference alike."""
+
+    near: float = 0.01
+    """Gaussians with a view-space depth at or below this are culled, in world units."""
+    eps2d: float = 0.3
+    """Added to the diagonal of the 2D covariance, in pixel^2."""
+    alpha_min: float = 1.0 / 255.0
+    """Contributions below this are skipped: part of the image model, not an approximation."""
+    alpha_max: float = 0.99
+    """Alpha is clamped here; the gradient beyond is zero."""
+    transmittance_min: float = 1e-4
+    """A group of a pixel is done once its transmittance is at or below this."""
+    stop: Literal["after", "before"] = "after"
+    """Whether the contribution that crosses `transmittance_min` is still included; ``before`` is 3DGS's."""
+    fov_margin: float = 0.3
+    """Slack of the x/z, y/z clamp in the projection's Jacobian, as a share of half the image: x/z is kept in
+    ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]`` with m this value."""
+    memory_budget: int = 2 << 30
+    """Bytes the tile lists may take; more is refused with an error before anything is allocated."""
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What `vlgs.rasterize` returns."""
+
+    images: tuple[Float[Tensor, "h w _"], ...]
+    """One per group; no background is added."""
+    alphas: tuple[Float[Tensor, "h w"], ...]
+    """One per group: accumulated weight, 1 - final transmittance."""
+    visible: Bool[Tensor, " n"]
+    """Whether the Gaussian reaches any pixel above `RasterConfig.alpha_min` in any group."""
+    mean2d: Float[Tensor, "n 2"]
+    """Projected centres in pixels; `retain_grad()` on it feeds densification."""
