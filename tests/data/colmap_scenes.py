@@ -1,0 +1,64 @@
+"""Small COLMAP scenes for the tests of `vlgs.data.colmap`, written by pycolmap."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from vlgs.data.lens import import_pycolmap
+
+pycolmap = import_pycolmap()
+
+WIDTH, HEIGHT = 24, 18
+PINHOLE = ("PINHOLE", (20.0, 21.0, 12.5, 8.5))
+
+
+def picture(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """Random pixels that survive PNG."""
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
+
+
+def write_model(
+    folder: Path,
+    names: list[str],
+    camera: tuple[str, tuple[float, ...]] = PINHOLE,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    points: int = 6,
+    text: bool = False,
+) -> Any:
+    """A `pycolmap.Reconstruction` whose points are all seen by all images, at poses that differ."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model=camera[0], width=size[0], height=size[1], params=camera[1], camera_id=1
+        )
+    )
+    rng = np.random.default_rng(0)
+    for i, name in enumerate(names, start=1):
+        angle = 0.1 * i
+        quat_xyzw = np.array([0, np.sin(angle / 2), 0, np.cos(angle / 2)])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quat_xyzw), np.array([0.1 * i, 0.2, 3.0]))
+        image = pycolmap.Image(
+            name=name, keypoints=rng.uniform(0, 18, (points, 2)), camera_id=1, image_id=i
+        )
+        model.add_image_with_trivial_frame(image, pose)
+    for p in range(points):
+        track = pycolmap.Track()
+        for i in range(1, len(names) + 1):
+            track.add_element(i, p)
+        model.add_point3D(rng.normal(size=3), track, rng.integers(0, 256, 3).astype(np.uint8))
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_text(str(folder)) if text else model.write(str(folder))
+    return model
+
+
+def write_scene(root: Path, n: int = 9, **model) -> list[str]:
+    """A whole scene; returns the stems, in order."""
+    names = [f"frame_{i:05d}.png" for i in range(n)]
+    write_model(root / "sparse" / "0", names, **model)
+    (root / "images").mkdir()
+    size = model.get("size", (WIDTH, HEIGHT))
+    for i, name in enumerate(names):
+        Image.fromarray(picture(i, *size)).save(root / "images" / name)
+    return [Path(name).stem for name in names]

@@ -1,0 +1,162 @@
+"""Is this scene usable? `python -m vlgs.check data=colmap data.root=PATH` lists every fault; exit status 1 if one is an error."""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
+from rich.console import Console
+from torch import Tensor
+
+from vlgs.config import CONF, check_targets, instantiate
+from vlgs.data.colmap import ColmapSource, survey
+from vlgs.data.faults import Fault, SceneError, errors, listing, warning
+from vlgs.types import IGNORE_ID, Scene, View
+
+_COLMAP = "vlgs.data.colmap.load_scene"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is wrong with a scene and, where it can be loaded, what it holds."""
+
+    faults: tuple[Fault, ...]
+    summary: tuple[str, ...]
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def main(config: DictConfig) -> None:
+    """Print the report; see the module."""
+    try:
+        check_targets(config)
+        report = check(config.data)
+    except MissingMandatoryValue as error:
+        sys.exit(f"error: {error.full_key} must be given")
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    print_report(report)
+    if errors(report.faults):
+        sys.exit(1)
+
+
+def check(data: DictConfig) -> Report:
+    """Look at all that a `data` group leads to, and decode every file once.
+
+    A COLMAP scene that is at fault in one place is still looked at in all others; another source has files of its own only
+    if its loader says so, and one that does not load is one fault.
+
+    Raises:
+        FileNotFoundError: If there is no scene.
+        ValueError: If an option is out of range.
+    """
+    if data._target_ != _COLMAP:
+        scene = instantiate(data)
+        return Report(tuple(check_scene(scene)), tuple(summarize(scene)))
+    options = OmegaConf.to_container(data, resolve=True, throw_on_missing=True)
+    assert isinstance(options, dict)
+    found = survey(ColmapSource(**{str(k): v for k, v in options.items() if k != "_target_"}))
+    if found.scene is not None:
+        faults = (*found.faults, *check_scene(found.scene))
+        return Report(faults, tuple(summarize(found.scene)))
+    contents = (fault for source in found.views for fault in view_faults(source.view()))
+    return Report((*found.faults, *contents), ())
+
+
+def check_scene(scene: Scene) -> Iterator[Fault]:
+    """What is wrong with the contents of a scene that has been loaded, whatever it was loaded from."""
+    for view in _views(scene):
+        yield from view_faults(view)
+    if not scene.test:
+        yield warning(
+            scene.name, "test views should be at least 1, got 0", "nothing will be measured"
+        )
+    known = set(scene.vocabulary.names) if scene.vocabulary else set()
+    if scene.vocabulary and (unknown := [name for name in scene.classes if name not in known]):
+        what = f"vocabulary should know every class, got none for {listing(unknown)}"
+        yield warning(scene.name, what, "these cannot be asked for")
+
+
+def view_faults(view: View) -> Iterator[Fault]:
+    """Decode everything that one view has, and hold the sizes against its camera."""
+    size = (view.camera.height, view.camera.width)
+    for what, read in _readers(view):
+        try:
+            maps = read()
+        except SceneError as error:
+            yield error.fault
+            continue
+        for pixels in maps:
+            if tuple(pixels.shape[:2]) != size:
+                got = tuple(pixels.shape[:2])
+                yield Fault(
+                    view.name, f"{what} must be {size} (height, width) as its camera, got {got}"
+                )
+        if what == "mask map" and not (maps[0] >= 0).any():
+            yield warning(view.name, "mask map should reach a pixel, got -1 everywhere")
+        if what == "dense labels" and (maps[0] == IGNORE_ID).all():
+            yield warning(view.name, "dense labels should name a class, got ignored pixels only")
+
+
+def summarize(scene: Scene) -> Iterator[str]:
+    """What a scene holds, a line each."""
+    views = _views(scene)
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    cameras = {tuple(view.camera.K.flatten().tolist()) for view in views}
+    labelled = [v for v in scene.test if v.read_dense_labels or v.read_object_labels]
+    masked = [v for v in scene.train if v.read_masks]
+    pixels = sum(v.camera.width * v.camera.height for v in views)
+    mask_pixels = sum(v.camera.width * v.camera.height for v in masked)
+    decoded = 3 * pixels + 4 * mask_pixels + scene.mask_vectors.nbytes
+    yield f"scene       {scene.name}, fingerprint {scene.fingerprint}"
+    yield f"views       {len(scene.train)} train, {len(scene.test)} test (split {scene.split})"
+    yield f"sizes       {listing((f'{width} x {height}' for width, height in sizes), 4)}"
+    yield f"cameras     {len(cameras)}"
+    yield f"points      {len(scene.points)}"
+    yield (
+        f"language    {len(scene.mask_vectors)} vectors of width {scene.mask_vectors.shape[1]} on {len(masked)} training "
+        f"views, {scene.mask_areas.sum().item() / max(1, mask_pixels):.0%} of their pixels"
+    )
+    yield f"labels      {len(labelled)} of {len(scene.test)} test views, {len(scene.classes)} classes"
+    yield f"vocabulary  {len(scene.vocabulary.names) if scene.vocabulary else 0} words"
+    yield f"memory      {decoded / 2**20:.0f} MiB for all photographs and masks, decoded"
+
+
+def print_report(report: Report) -> None:
+    """Summary, then errors, then warnings, then the verdict."""
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    for line in report.summary:
+        console.print(line)
+    wrong = errors(report.faults)
+    doubtful = [fault for fault in report.faults if fault.severity == "warning"]
+    for fault in (*wrong, *doubtful):
+        style = "bold red" if fault.severity == "error" else "yellow"
+        console.print(f"{fault.severity:<8}", style=style, end="")
+        console.print(str(fault))
+    verdict = "not usable" if wrong else "usable"
+    console.print(f"{verdict}: {len(wrong)} errors, {len(doubtful)} warnings")
+
+
+def _views(scene: Scene) -> list[View]:
+    """Every view once: a split may test what it trains on."""
+    return list({view.name: view for view in (*scene.train, *scene.test)}.values())
+
+
+def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]:
+    """Name and pixels of everything that a view can read."""
+    image, masks, valid = view.read_image, view.read_masks, view.read_valid
+    dense, objects = view.read_dense_labels, view.read_object_labels
+    yield "image", lambda: [image()]
+    if masks is not None:
+        yield "mask map", lambda: [masks()]
+    if valid is not None:
+        yield "valid map", lambda: [valid()]
+    if dense is not None:
+        yield "dense labels", lambda: [dense().ids]
+    if objects is not None:
+        yield "object labels", lambda: list(objects().masks.values())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,280 @@
+"""A photographed scene: COLMAP's cameras and points, with labels and language maps where there are any.
+
+    <root>/images/<name>.jpg                  or images_2, images_4, ...: scaled copies
+    <root>/sparse/0/{cameras,images,points3D}.bin (or .txt; or right under sparse/)
+    <root>/labels/                            optional: LERF-OVS JSON, or dense PNG and classes.json
+    <root>/language_features/<stem>_{s,f}.npy optional: LangSplat's layout, and vocabulary.npz
+
+Labels and language maps are matched to images by file stem and lie in the geometry of the image file: what the loader does
+to a photograph (undistort, resize) it does to them.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vlgs.data.cache import PixelCache
+from vlgs.data.faults import Fault, FaultList, SceneError, errors, require_sound
+from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
+from vlgs.data.language import read_vocabulary
+from vlgs.data.masks import MaskTable, gather_masks, missing_faults
+from vlgs.data.registered import ImageFolder, attach_labels, coverage_warnings, open_views
+from vlgs.data.sparse import SparseModel, find_sparse, model_faults, read_sparse
+from vlgs.data.split import Split
+from vlgs.data.views import ViewSource
+from vlgs.types import Scene, Vocabulary
+
+_VERSION = "vlgs.data.colmap 1"
+"""Part of the fingerprint: to be raised when the same files lead to other pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapSource:
+    """What to read, and how. The keys of ``conf/data/colmap.yaml``."""
+
+    root: str
+    """Folder of the scene."""
+    images: str = "images"
+    """Image folder below it."""
+    resize: float = 1.0
+    """Size of the output as a fraction of the image file's, in (0, 1]; pixels are averaged over their area."""
+    split: str = "llff"
+    """See `vlgs.data.split.Split`."""
+    test: Sequence[str] = ()
+    """Stems of the test views, with split=list."""
+    every: int = 8
+    """One view of so many is held out, with split=llff."""
+    labels: str | None = None
+    """Label folder; by default ``<root>/labels`` if there is one."""
+    features: str | None = None
+    """Folder of language maps; by default ``<root>/language_features`` if there is one."""
+    vocabulary: str | None = None
+    """npz or JSON of text vectors; by default ``<features>/vocabulary.npz`` if there is one."""
+    level: int = 3
+    """Mask level: 0 default, 1 subpart, 2 part, 3 whole."""
+    allow_missing_masks: bool = False
+    """Whether a training view may lack language maps where others have them."""
+    cache_bytes: int = 1 << 30
+    """Decoded pixels that are kept in memory."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.resize <= 1:
+            raise ValueError(f"data: resize must be in (0, 1], got {self.resize}")
+        if self.level not in range(4):
+            raise ValueError(f"data: level must be 0, 1, 2 or 3, got {self.level}")
+        if self.cache_bytes < 0:
+            raise ValueError(f"data: cache_bytes must not be negative, got {self.cache_bytes}")
+        _ = self.rule
+
+    @property
+    def rule(self) -> Split:
+        """How the views are divided."""
+        return Split(self.split, tuple(map(str, self.test)), self.every)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A scene's files, looked at: what is wrong with them, and what can be read all the same."""
+
+    faults: tuple[Fault, ...]
+    model: SparseModel | None = None
+    """None if the sparse files do not read."""
+    views: tuple[ViewSource, ...] = ()
+    """Every view whose photograph and camera are sound, in order of image name."""
+    scene: Scene | None = None
+    """None if a fault is an error."""
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What a scene is put together from."""
+
+    model: SparseModel
+    views: tuple[ViewSource, ...]
+    labels: DenseFolder | ObjectFolder | None
+    masks: MaskTable | None
+    vocabulary: Vocabulary | None
+
+
+def load_scene(root: str, **options: Any) -> Scene:
+    """Read a COLMAP scene (S. C.1, C.2, C.4); the `_target_` of ``conf/data/colmap.yaml``.
+
+    Pixels stay on disk until a view's readers are called. Views are in order of image name.
+
+    Args:
+        root: Folder of the scene.
+        options: Fields of `ColmapSource`.
+
+    Raises:
+        FileNotFoundError: If the scene, or a file or folder that was named, is not there.
+        SceneError: For the first thing wrong with its files; ``python -m vlgs.check`` lists all.
+        ValueError: If an option is out of range.
+    """
+    found = survey(ColmapSource(root=root, **options))
+    require_sound(found.faults)
+    assert found.scene is not None
+    return found.scene
+
+
+def survey(source: ColmapSource) -> Survey:
+    """Look at all files of a scene and collect what is wrong; images and label maps are opened, not decoded.
+
+    Raises:
+        FileNotFoundError: If the scene, or a file or folder that was named, is not there.
+    """
+    folder, suffix = _require_tree(source)
+    try:
+        model = read_sparse(folder, suffix)
+    except SceneError as error:
+        return Survey((error.fault,))
+    faults = FaultList(model_faults(model))
+    images = ImageFolder(
+        Path(source.root) / source.images, source.resize, PixelCache(source.cache_bytes)
+    )
+    views = faults.take(open_views(model, images))
+    faults += coverage_warnings(model, views, images)
+    labels = faults.take(_open_labels(source))
+    views = faults.take(attach_labels(views, labels, images))
+    faults += source.rule.faults(*_names(views), source.root)
+    masks = faults.take(_open_masks(source, views))
+    vocabulary = faults.take(_open_vocabulary(source, masks))
+    if errors(faults):
+        return Survey(tuple(faults), model, views)
+    scene = _assemble(source, _Parts(model, views, labels, masks, vocabulary))
+    return Survey(tuple(faults), model, views, scene)
+
+
+def _require_tree(source: ColmapSource) -> tuple[Path, str]:
+    """Folder and suffix of the sparse files."""
+    root = Path(source.root)
+    found = find_sparse(root)
+    if found is None or not (root / source.images).is_dir():
+        tree = f"""
+  {root}/
+    {source.images}/<name>.jpg ...
+    sparse/0/cameras.bin images.bin points3D.bin   (or .txt; or right under sparse/)"""
+        absent = f"no {root / source.images}" if found else "no sparse model"
+        absent = absent if root.is_dir() else "no such folder"
+        raise FileNotFoundError(
+            f"data: root must hold a COLMAP scene, got {absent}; looked for{tree}"
+        )
+    return found
+
+
+def _named_or_default(named: str | None, default: Path, key: str) -> Path | None:
+    """The path that was named; else the default, or None if that is not there."""
+    if named is None:
+        return default if default.exists() else None
+    if not Path(named).exists():
+        raise FileNotFoundError(f"data: {key} must exist, got {named}")
+    return Path(named)
+
+
+def _open_labels(
+    source: ColmapSource,
+) -> tuple[DenseFolder | ObjectFolder | None, tuple[Fault, ...]]:
+    folder = _named_or_default(source.labels, Path(source.root) / "labels", "labels")
+    return (None, ()) if folder is None else open_labels(folder)
+
+
+def _feature_folder(source: ColmapSource) -> Path | None:
+    default = Path(source.root) / "language_features"
+    return _named_or_default(source.features, default, "features")
+
+
+def _open_masks(
+    source: ColmapSource, views: Sequence[ViewSource]
+) -> tuple[MaskTable | None, tuple[Fault, ...]]:
+    """Language maps of the training views only: those of the test views must not be learned from."""
+    folder = _feature_folder(source)
+    if folder is None:
+        return None, ()
+    train, _ = source.rule.divide(*_names(views))
+    training = [view for view in views if view.name in set(train)]
+    table, found = gather_masks(training, folder, source.level)
+    return table, (*found, *missing_faults(table, training, folder, source.allow_missing_masks))
+
+
+def _open_vocabulary(
+    source: ColmapSource, masks: MaskTable | None
+) -> tuple[Vocabulary | None, tuple[Fault, ...]]:
+    folder = _feature_folder(source) or Path(source.root) / "language_features"
+    path = _named_or_default(source.vocabulary, folder / "vocabulary.npz", "vocabulary")
+    if path is None:
+        return None, ()
+    try:
+        vocabulary = read_vocabulary(path)
+    except SceneError as error:
+        return None, (error.fault,)
+    width = vocabulary.vectors.shape[1]
+    if masks is not None and len(masks.vectors) and masks.vectors.shape[1] != width:
+        what = f"embeddings must be {masks.vectors.shape[1]} wide as the mask vectors, got {width}"
+        advice = "text and masks must come from one encoder"
+        return None, (Fault(str(path), what, advice),)
+    return vocabulary, ()
+
+
+def _assemble(source: ColmapSource, parts: _Parts) -> Scene:
+    """The scene of files that are sound."""
+    train, test = source.rule.divide(*_names(parts.views))
+    bound = parts.masks.sources if parts.masks is not None else {}
+    readable = {v.name: bound.get(v.name, v).view() for v in parts.views}
+    empty = torch.zeros(0, 512 if parts.vocabulary is None else parts.vocabulary.vectors.shape[1])
+    classes, kinds = _classes(parts.labels, {v.name for v in parts.views})
+    return Scene(
+        name=Path(source.root).resolve().name,
+        train=tuple(readable[name] for name in train),
+        test=tuple(readable[name] for name in test),
+        split=source.rule.name,
+        points=torch.from_numpy(parts.model.points).float(),
+        point_colors=torch.from_numpy(parts.model.point_colors),
+        mask_vectors=empty if parts.masks is None else parts.masks.vectors,
+        mask_areas=torch.zeros(0) if parts.masks is None else parts.masks.areas,
+        classes=classes,
+        class_kinds=kinds,
+        vocabulary=parts.vocabulary,
+        fingerprint=_fingerprint(source, parts),
+    )
+
+
+def _classes(
+    labels: DenseFolder | ObjectFolder | None, views: Set[str]
+) -> tuple[tuple[str, ...], Mapping[str, str]]:
+    if isinstance(labels, DenseFolder):
+        return labels.classes, labels.class_kinds
+    if labels is None:
+        return (), {}
+    images = (image for stem, image in labels.images.items() if stem in views)
+    return tuple(sorted({item.category for image in images for item in image.objects})), {}
+
+
+def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
+    """Hash of what was read, as far as it can move a number; where it was read from does not count."""
+    hasher = hashlib.blake2b(digest_size=16)
+    options = (source.resize, source.level, source.rule, parts.model.cameras)
+    hasher.update(repr((_VERSION, options)).encode())
+    hasher.update(parts.model.points.tobytes() + parts.model.point_colors.tobytes())
+    if parts.masks is not None:
+        hasher.update(parts.masks.digest)
+    if parts.vocabulary is not None:
+        hasher.update(repr(parts.vocabulary.names).encode())
+        hasher.update(parts.vocabulary.vectors.numpy().tobytes())
+    if isinstance(parts.labels, DenseFolder):
+        hasher.update(repr((parts.labels.classes, sorted(parts.labels.position.items()))).encode())
+    for view in parts.views:
+        files = [view.photograph.path] + ([view.labels.files[view.name]] if view.labels else [])
+        hasher.update(repr((view.name, view.lens, len(files))).encode())
+        hasher.update(view.camera.viewmat.numpy().tobytes())
+        for file in files:
+            with file.open("rb") as stream:
+                hasher.update(hashlib.file_digest(stream, "blake2b").digest())
+    return hasher.hexdigest()
+
+
+def _names(views: Sequence[ViewSource]) -> tuple[list[str], list[str]]:
+    """Names of all views and of the labelled ones."""
+    return [v.name for v in views], [v.name for v in views if v.labels is not None]

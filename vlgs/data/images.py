@@ -1,0 +1,127 @@
+"""Image files -> uint8 RGB in the geometry of their COLMAP camera."""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from vlgs.data.faults import Fault, SceneError
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+
+UNREADABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+"""What Pillow raises on a damaged file, besides what it is documented to raise."""
+
+_ORIENTATION = 0x0112
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image file whose header was read, and how its pixels are to be taken."""
+
+    path: Path
+    width: int
+    """Of what `read_photograph` returns."""
+    height: int
+    turned: bool
+    """Whether the EXIF orientation is applied."""
+    tagged: bool
+    """Whether the file carries an EXIF orientation at all."""
+
+
+def open_photograph(path: Path, camera_size: tuple[int, int]) -> Photograph:
+    """Read the header of an image and hold its size against that of its camera.
+
+    COLMAP ignores the EXIF orientation, so pixels are taken as stored wherever they fit the camera; the orientation is
+    applied only where nothing else fits, which is how a camera made by another tool is told apart.
+
+    Args:
+        path: The file.
+        camera_size: Width and height of the COLMAP camera; the image may be a scaled copy (``images_4``).
+
+    Raises:
+        SceneError: If the file cannot be read or has another shape than the camera.
+    """
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            orientation = image.getexif().get(_ORIENTATION, 1)
+            mode = image.mode
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    if mode in ("I", "F"):
+        raise SceneError(Fault(str(path), f"pixels must be 8 or 16 bit integers, got mode {mode}"))
+    tagged = orientation not in (0, 1)
+    if is_copy_of((width, height), camera_size):
+        return Photograph(path, width, height, turned=False, tagged=tagged)
+    if orientation in (5, 6, 7, 8) and is_copy_of((height, width), camera_size):
+        return Photograph(path, height, width, turned=True, tagged=tagged)
+    expected = f"{camera_size[0]} x {camera_size[1]} as its camera, or a scaled copy of that"
+    advice = "take the images that COLMAP saw"
+    raise SceneError(Fault(str(path), f"size must be {expected}, got {width} x {height}", advice))
+
+
+def read_photograph(photograph: Photograph) -> UInt8[Tensor, "h w 3"]:
+    """Decode the whole file. 16 bit becomes 8, grey becomes three equal channels, transparency lies on black.
+
+    Raises:
+        SceneError: If the file is truncated or damaged.
+    """
+    try:
+        with Image.open(photograph.path) as image:
+            rgb = _to_rgb(ImageOps.exif_transpose(image) if photograph.turned else image)
+    except UNREADABLE as error:
+        raise _unreadable(photograph.path, error) from error
+    return torch.from_numpy(np.array(rgb))
+
+
+def is_copy_of(size: tuple[int, int], camera: tuple[int, int]) -> bool:
+    """Whether an image of this size shows what the camera shows: equal, or scaled with each side within a pixel.
+
+    A size that is off by less than 3 % on both sides was cropped or padded, not scaled.
+
+    Example:
+        >>> is_copy_of((1237, 822), (4946, 3286)), is_copy_of((493, 365), (492, 364))
+        (True, False)
+    """
+    if size == camera:
+        return True
+    ratios = [side / whole for side, whole in zip(size, camera, strict=True)]
+    if any(abs(ratio - 1) < 0.03 for ratio in ratios):
+        return False
+    return any(
+        abs(side - whole * ratio) <= 1
+        for side, whole, ratio in zip(size, camera, reversed(ratios), strict=True)
+    )
+
+
+def _to_rgb(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I;16"):
+        grey = np.asarray(image).astype(np.uint32)
+        return Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8)).convert("RGB")
+    if image.has_transparency_data:
+        rgba = image.convert("RGBA")
+        return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert(
+            "RGB"
+        )
+    return image.convert("RGB")
+
+
+def _unreadable(path: Path, error: BaseException) -> SceneError:
+    size = path.stat().st_size if path.is_file() else 0
+    what = f"content must be a whole image, got {size} bytes that do not decode ({error})"
+    return SceneError(Fault(str(path), what, "copy the file again"))
