@@ -1,0 +1,61 @@
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from vlgs.indicator import ColourOpacity, Fixed, Learned
+from vlgs.types import Gaussians
+
+CONF = Path(__file__).parents[2] / "conf" / "indicator"
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    n = 4
+    return Gaussians(
+        means=torch.randn(n, 3),
+        quats=torch.randn(n, 4),
+        scales=torch.rand(n, 3),
+        opacities=torch.rand(n, requires_grad=True),
+        indicators=torch.rand(n, requires_grad=True),
+        sh0=torch.randn(n, 3),
+        shN=torch.randn(n, 3, 3),
+        features=torch.randn(n, 3),
+    )
+
+
+def test_learned_is_the_parameter(gaussians: Gaussians):
+    assert Learned()(gaussians) is gaussians.indicators
+
+
+def test_opacity_is_the_very_tensor_that_colour_uses(gaussians: Gaussians):
+    assert ColourOpacity()(gaussians) is gaussians.opacities
+
+
+def test_detached_opacity_gets_no_gradient(gaussians: Gaussians):
+    weight = ColourOpacity(detach=True)(gaussians)
+    assert torch.equal(weight, gaussians.opacities)
+    assert not weight.requires_grad
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_fixed_is_one_constant(gaussians: Gaussians, value: float):
+    weight = Fixed(value)(gaussians)
+    assert weight.tolist() == [value] * 4
+    assert not weight.requires_grad
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
+def test_fixed_outside_the_unit_interval_is_refused(value: float):
+    with pytest.raises(ValueError, match=r"Fixed: value must be in \[0, 1\], got"):
+        Fixed(value)
+
+
+@pytest.mark.parametrize(
+    ("option", "want"),
+    [("learned", Learned()), ("opacity", ColourOpacity()), ("fixed", Fixed(1.0))],
+)
+def test_option_is_the_default_of_its_class(option: str, want: object):
+    assert instantiate(OmegaConf.load(CONF / f"{option}.yaml")) == want

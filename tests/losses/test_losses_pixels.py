@@ -1,0 +1,160 @@
+import math
+from pathlib import Path
+
+import jaxtyping
+import pytest
+import torch
+from hydra.utils import instantiate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from vlgs.losses import Losses, l1_dssim, masked_cosine, masked_l1, masked_mse, ssim
+
+CONF = Path(__file__).parents[2] / "conf" / "loss"
+PIXELWISE = [masked_mse, masked_l1, masked_cosine]
+VALID = torch.tensor([[True, False], [True, True], [False, True]])
+
+
+def maps(seed: int = 0, channels: int = 3) -> tuple[Tensor, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    render, target = torch.randn(2, 3, 2, channels, generator=g, dtype=torch.float64)
+    return render.requires_grad_(), target
+
+
+def test_by_hand():
+    render = torch.tensor([[[1.0, 2.0], [9.0, 9.0]]])
+    target = torch.tensor([[[3.0, 1.0], [0.0, 0.0]]])
+    valid = torch.tensor([[True, False]])
+    assert masked_mse(render, target, valid).item() == 2.5  # (4 + 1) / 2
+    assert masked_l1(render, target, valid).item() == 1.5
+    assert masked_cosine(render, target, valid).item() == pytest.approx(1 - 5 / math.sqrt(50))
+    assert masked_mse(render, target, valid, "all").item() == 1.25
+    assert masked_l1(render, target, valid, "all").item() == 0.75
+    assert masked_cosine(render, target, valid, "all").item() == pytest.approx(
+        (1 - 5 / math.sqrt(50)) / 2
+    )
+
+
+@pytest.mark.parametrize("pixels", ["valid", "all"])
+@pytest.mark.parametrize("loss", PIXELWISE)
+def test_full_mask_equals_no_mask(loss, pixels):
+    render, target = maps()
+    full = torch.ones(3, 2, dtype=torch.bool)
+    torch.testing.assert_close(loss(render, target, full, pixels), loss(render, target))
+
+
+@pytest.mark.parametrize("valid", [None, VALID])
+@pytest.mark.parametrize("loss", [*PIXELWISE, l1_dssim])
+def test_gradient(loss, valid: Tensor | None):
+    render, target = maps()
+    assert torch.autograd.gradcheck(lambda x: loss(x, target, valid), (render,), fast_mode=True)
+
+
+@pytest.mark.parametrize("loss", [*PIXELWISE, l1_dssim])
+@pytest.mark.parametrize("rubbish", [float("nan"), float("inf"), 1e30])
+def test_what_stands_outside_the_mask_is_never_looked_at(loss, rubbish: float):
+    render, target = maps()
+    want = loss(render, target, VALID)
+    (want_grad,) = torch.autograd.grad(want, render)
+    dirty = target.masked_fill(~VALID[..., None], rubbish)
+    got = loss(render, dirty, VALID)
+    (got_grad,) = torch.autograd.grad(got, render)
+    assert torch.equal(got, want)
+    assert torch.equal(got_grad, want_grad)
+    assert (want_grad[~VALID] == 0).all()
+
+
+@pytest.mark.parametrize("loss", [*PIXELWISE, l1_dssim])
+def test_no_valid_pixel_is_no_loss_and_no_gradient(loss):
+    render, target = maps()
+    value = loss(render, target, torch.zeros(3, 2, dtype=torch.bool))
+    value.backward()
+    assert value.item() == 0
+    assert render.grad is not None
+    assert (render.grad == 0).all()
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=25, deadline=None)
+def test_masked_mean_is_the_mean_of_the_pixels_left(seed: int):
+    render, target = maps(seed)
+    valid = torch.rand(3, 2, generator=torch.Generator().manual_seed(seed)) > 0.5
+    if valid.any():
+        for loss in PIXELWISE:
+            rows = render[valid][None], target[valid][None]
+            torch.testing.assert_close(loss(render, target, valid), loss(*rows))
+
+
+def test_cosine_of_parallel_opposite_and_orthogonal():
+    render = torch.tensor([[[2.0, 0.0]]])
+    for target, want in (([5.0, 0.0], 0.0), ([-3.0, 0.0], 2.0), ([0.0, 1.0], 1.0)):
+        assert masked_cosine(render, torch.tensor([[target]])).item() == pytest.approx(want)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-40, 1e-20])
+@pytest.mark.parametrize("target", [0.0, 1.0])
+def test_cosine_of_vanishing_vectors_has_a_finite_gradient(scale: float, target: float):
+    render = torch.full((2, 2, 3), scale, requires_grad=True)
+    loss = masked_cosine(render, torch.full((2, 2, 3), target))
+    loss.backward()
+    assert loss.item() == pytest.approx(1)
+    assert render.grad is not None
+    assert render.grad.isfinite().all()
+    assert (render.grad < 0).any() == (target > 0)  # codes that start at zero still learn
+
+
+def test_weights_of_the_overall_loss():
+    color, image = torch.full((2, 2, 3), 0.5), torch.zeros(2, 2, 3)
+    feature, target = torch.full((2, 2, 1), 3.0), torch.ones(2, 2, 1)
+    valid = torch.tensor([[True, False], [False, False]])
+    losses = Losses()
+    assert losses.raster_loss(color, image, feature, target, valid).item() == 0.25 + 4
+    assert losses.blended_loss(feature, target, valid, 0.5).item() == pytest.approx(1.2 * 0.5 * 4)
+    everywhere = Losses(lang_pixels="all", blend_weight=2.0)
+    assert everywhere.blended_loss(feature, target, valid, 1.0).item() == 2.0
+
+
+def test_options_choose_their_function():
+    render, target = (x.detach().float() for x in maps())
+    language = {
+        masked_mse: Losses(lang_loss="mse"),
+        masked_l1: Losses(lang_loss="l1"),
+        masked_cosine: Losses(lang_loss="cos"),
+    }
+    color = {masked_mse: Losses(rgb_loss="mse"), l1_dssim: Losses(rgb_loss="l1_dssim")}
+    for valid in (None, VALID):
+        for loss, losses in language.items():
+            got = losses.language_loss(render, target, valid)
+            assert torch.equal(got, loss(render, target, valid))
+        for loss, losses in color.items():
+            assert torch.equal(
+                losses.color_loss(render, target, valid), loss(render, target, valid)
+            )
+
+
+def test_default_option_is_the_default_of_the_class():
+    assert instantiate(OmegaConf.load(CONF / "default.yaml")) == Losses()
+
+
+def test_bad_input_is_refused(monkeypatch: pytest.MonkeyPatch):
+    # The run-time types would speak first.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(ValueError, match="rgb_loss must be one of mse, l1_dssim, got 'l2'"):
+        Losses(rgb_loss="l2")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="lang_loss must be one of mse, l1, cos, got 'l2'"):
+        Losses(lang_loss="l2")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="lang_pixels must be one of valid, all, got 'some'"):
+        Losses(lang_pixels="some")  # pyright: ignore[reportArgumentType]
+    for weight in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="blend_weight must be finite and >= 0, got"):
+            Losses(blend_weight=weight)
+    for loss in (*PIXELWISE, l1_dssim, ssim):
+        with pytest.raises(ValueError, match=r"target must be \(2, 3, 1\), got \(3, 2, 1\)"):
+            loss(torch.zeros(2, 3, 1), torch.zeros(3, 2, 1))
+    for loss in (*PIXELWISE, l1_dssim):
+        with pytest.raises(ValueError, match=r"valid must be \(2, 3\), got \(3, 2\)"):
+            loss(torch.zeros(2, 3, 1), torch.zeros(2, 3, 1), VALID)
+    with pytest.raises(ValueError, match=r"must have pixels, got shape \(0, 4, 3\)"):
+        ssim(torch.zeros(0, 4, 3), torch.zeros(0, 4, 3))

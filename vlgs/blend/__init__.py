@@ -1,0 +1,17 @@
+"""Camera-view blending: a third camera between two real ones, and the language map it should see (Eqs. slerp, lerp, blend)."""
+
+from vlgs.blend.pose import blend_camera, slerp
+from vlgs.blend.ratio import BetaBlend, FixedBlend, GaussianBlend, NoBlend, UniformBlend, ViewBlend
+from vlgs.blend.target import blend_targets
+
+__all__ = [
+    "BetaBlend",
+    "FixedBlend",
+    "GaussianBlend",
+    "NoBlend",
+    "UniformBlend",
+    "ViewBlend",
+    "blend_camera",
+    "blend_targets",
+    "slerp",
+]

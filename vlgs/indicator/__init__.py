@@ -1,0 +1,60 @@
+"""Which weight per Gaussian blends language: l in Eq. lancity, or what an ablation puts in its place (S. D.10, D.15)."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.types import Gaussians
+
+
+@runtime_checkable
+class Indicator(Protocol):
+    """The whole contract."""
+
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
+        """Return the weight in [0, 1] with which each Gaussian's language code is blended."""
+        ...
+
+
+@dataclass(frozen=True)
+class Learned:
+    """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. lancity)."""
+
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
+        """Return `gaussians.indicators` itself."""
+        return gaussians.indicators
+
+
+@dataclass(frozen=True)
+class ColourOpacity:
+    """Language blended with the colour opacity, as earlier systems do (Eq. lang_render)."""
+
+    detach: bool = False
+    """Whether the language loss is kept from moving the opacity; the paper lets it (S. D.15)."""
+
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
+        """Return `gaussians.opacities` itself, so that the rasteriser runs one transmittance chain for both modalities."""
+        return gaussians.opacities.detach() if self.detach else gaussians.opacities
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """One constant for every Gaussian, not learned (the "fixed to" rows of tab:ab-multi B).
+
+    Raises:
+        ValueError: If the value is outside [0, 1].
+    """
+
+    value: float
+    """Above `RasterConfig.alpha_max` the rasteriser caps it."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.value <= 1:
+            raise ValueError(f"Fixed: value must be in [0, 1], got {self.value}")
+
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
+        """Return a new tensor without gradient."""
+        return torch.full_like(gaussians.opacities, self.value, requires_grad=False)

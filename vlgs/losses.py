@@ -1,0 +1,267 @@
+"""What is minimised: Eqs. raster, blend and overall, and the alternatives that S. D.8 lists.
+
+Images and maps are ``[h, w, c]``. A mask says which pixels count; what the target holds at the others is never looked at,
+so that it may be anything, NaN included.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import conv2d, l1_loss, mse_loss
+
+Pixels = Literal["valid", "all"]
+"""Whose number an average is divided by: pixels that have a target, or all of them (LangSplat's habit, S. A.2)."""
+
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+L1_SHARE = 0.8
+RENDER_FLOOR = 1e-2
+"""Shorter renders are treated as this long in `masked_cosine`: codes start at zero, where a cosine has no slope."""
+TARGET_FLOOR = 1e-6
+
+
+def masked_mse(
+    render: Float[Tensor, "h w c"],
+    target: Float[Tensor, "h w c"],
+    valid: Bool[Tensor, "h w"] | None = None,
+    pixels: Pixels = "valid",
+) -> Float[Tensor, ""]:
+    """Mean squared error over the pixels that count, and over channels; 0 without such a pixel (Eq. raster).
+
+    Raises:
+        ValueError: If the shapes differ.
+
+    Example:
+        >>> render, valid = torch.full((1, 2, 1), 3.0), torch.tensor([[True, False]])
+        >>> masked_mse(render, torch.ones(1, 2, 1), valid), masked_mse(render, torch.ones(1, 2, 1), valid, "all")
+        (tensor(4.), tensor(2.))
+    """
+    _require_shapes("masked_mse", render, target, valid)
+    if valid is None:
+        return mse_loss(render, target)
+    total = mse_loss(render, _filled(target, valid, render), reduction="sum")
+    return total / _count(render, valid, pixels)
+
+
+def masked_l1(
+    render: Float[Tensor, "h w c"],
+    target: Float[Tensor, "h w c"],
+    valid: Bool[Tensor, "h w"] | None = None,
+    pixels: Pixels = "valid",
+) -> Float[Tensor, ""]:
+    """Mean absolute error; otherwise as `masked_mse`."""
+    _require_shapes("masked_l1", render, target, valid)
+    if valid is None:
+        return l1_loss(render, target)
+    total = l1_loss(render, _filled(target, valid, render), reduction="sum")
+    return total / _count(render, valid, pixels)
+
+
+def masked_cosine(
+    render: Float[Tensor, "h w c"],
+    target: Float[Tensor, "h w c"],
+    valid: Bool[Tensor, "h w"] | None = None,
+    pixels: Pixels = "valid",
+) -> Float[Tensor, ""]:
+    """Mean of ``1 - cos(render, target)`` over pixels; otherwise as `masked_mse`.
+
+    Each side is divided by its own length, no less than `RENDER_FLOOR` or `TARGET_FLOOR`: a zero vector has cosine 0
+    with everything and a finite gradient.
+    """
+    _require_shapes("masked_cosine", render, target, valid)
+    if valid is not None:
+        target = target.masked_fill(~valid[..., None], 0)
+    direction = render / render.norm(dim=-1, keepdim=True).clamp_min(RENDER_FLOOR)
+    wanted = target / target.norm(dim=-1, keepdim=True).clamp_min(TARGET_FLOOR)
+    error = 1 - (direction * wanted).sum(dim=-1, keepdim=True)
+    if valid is None:
+        return error.mean()
+    return error.masked_fill(~valid[..., None], 0).sum() / _count(error, valid, pixels)
+
+
+def ssim(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Structural similarity in [-1, 1] of two images in [0, 1], as 3DGS computes it (S. A.1).
+
+    Gaussian window of 11 x 11 pixels, sigma 1.5, zeros beyond the edge, mean over pixels and channels. Differentiable;
+    images smaller than the window are fine.
+
+    Raises:
+        ValueError: If the shapes differ or an image has no pixels.
+
+    Example:
+        >>> image = torch.rand(20, 30, 3)
+        >>> ssim(image, image)
+        tensor(1.)
+    """
+    return ssim_map(a, b).mean()
+
+
+def ssim_map(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
+    """The terms of `ssim`, one per pixel and channel, from the moments of ``p = a + b`` and ``q = a - b``.
+
+    ``4 cov(a, b) = var p - var q`` and ``2 (var a + var b) = var p + var q``, and the same for the means. With both
+    variances clamped at 0, against the cancellation in E[x^2] - E[x]^2, each factor is within [-1, 1] whatever the
+    rounding, equal images give exactly 1, and four moments are filtered instead of five.
+    """
+    _require_shapes("ssim", a, b)
+    if a.numel() == 0:
+        raise ValueError(f"ssim: images must have pixels, got shape {tuple(a.shape)}")
+    total, gap = (a + b).permute(2, 0, 1), (a - b).permute(2, 0, 1)
+    moments = _filter(torch.cat([total, gap, total.square(), gap.square()]))
+    mean_p, mean_q, square_p, square_q = moments.chunk(4)
+    mean_p2, mean_q2 = mean_p.square(), mean_q.square()
+    var_p, var_q = (square_p - mean_p2).clamp_min(0), (square_q - mean_q2).clamp_min(0)
+    luminance = (mean_p2 - mean_q2 + 2 * SSIM_C1) / (mean_p2 + mean_q2 + 2 * SSIM_C1)
+    structure = (var_p - var_q + 2 * SSIM_C2) / (var_p + var_q + 2 * SSIM_C2)
+    return (luminance * structure).permute(1, 2, 0)
+
+
+def l1_dssim(
+    render: Float[Tensor, "h w c"],
+    image: Float[Tensor, "h w c"],
+    valid: Bool[Tensor, "h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """``0.8 L1 + 0.2 (1 - SSIM)``, the loss of 3DGS (S. A.1).
+
+    With a mask, both means are over its pixels, and windows that reach beyond it see no difference there.
+
+    Raises:
+        ValueError: If the shapes differ.
+    """
+    _require_shapes("l1_dssim", render, image, valid)
+    if valid is None:
+        return L1_SHARE * l1_loss(render, image) + (1 - L1_SHARE) * (1 - ssim(render, image))
+    image = image.masked_fill(~valid[..., None], 0)
+    render = torch.where(valid[..., None], render, image)
+    error = L1_SHARE * (render - image).abs() + (1 - L1_SHARE) * (1 - ssim_map(render, image))
+    return error.masked_fill(~valid[..., None], 0).sum() / _count(error, valid, "valid")
+
+
+@torch.no_grad()
+def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c"]) -> float:
+    """``max(0, SSIM(I1, I2))``, the weight of a pair in Eq. blend; a constant of the pair, so worth a cache.
+
+    SSIM goes down to -1, and a negative weight would reward a wrong render (S. D.12).
+    """
+    return max(0.0, ssim(image1, image2).item())
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Which terms Eq. overall is made of; the paper's are the defaults.
+
+    Raises:
+        ValueError: If a value is not one of those listed or the weight is negative.
+    """
+
+    rgb_loss: Literal["mse", "l1_dssim"] = "mse"
+    lang_loss: Literal["mse", "l1", "cos"] = "mse"
+    lang_pixels: Pixels = "valid"
+    blend_weight: float = 1.2
+    """lambda of Eq. overall."""
+
+    def __post_init__(self) -> None:
+        _require_choice("rgb_loss", self.rgb_loss, ("mse", "l1_dssim"))
+        _require_choice("lang_loss", self.lang_loss, tuple(_LANGUAGE))
+        _require_choice("lang_pixels", self.lang_pixels, ("valid", "all"))
+        if not 0 <= self.blend_weight < float("inf"):
+            raise ValueError(
+                f"Losses: blend_weight must be finite and >= 0, got {self.blend_weight}"
+            )
+
+    def color_loss(
+        self,
+        color: Float[Tensor, "h w 3"],
+        image: Float[Tensor, "h w 3"],
+        valid: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """First term of Eq. raster; `valid` are the pixels that the photograph covers."""
+        return (masked_mse if self.rgb_loss == "mse" else l1_dssim)(color, image, valid)
+
+    def language_loss(
+        self,
+        feature: Float[Tensor, "h w d"],
+        target: Float[Tensor, "h w d"],
+        valid: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """Second term of Eq. raster; `valid` are the pixels that have a language code."""
+        return _LANGUAGE[self.lang_loss](feature, target, valid, self.lang_pixels)
+
+    def raster_loss(
+        self,
+        color: Float[Tensor, "h w 3"],
+        image: Float[Tensor, "h w 3"],
+        feature: Float[Tensor, "h w d"],
+        target: Float[Tensor, "h w d"],
+        valid: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """L_raster of one view whose photograph covers every pixel (Eq. raster)."""
+        return self.color_loss(color, image) + self.language_loss(feature, target, valid)
+
+    def blended_loss(
+        self,
+        feature: Float[Tensor, "h w d"],
+        target: Float[Tensor, "h w d"],
+        valid: Bool[Tensor, "h w"] | None,
+        similarity: float,
+    ) -> Float[Tensor, ""]:
+        """``lambda L_b``: what the blended view adds to Eq. overall.
+
+        Args:
+            feature: Language rendered from the blended camera.
+            target: From `vlgs.blend.blend_targets`, as is `valid`.
+            valid: Pixels that count.
+            similarity: `view_similarity` of the pair; 1 where ``blend.ssim`` is off.
+        """
+        return self.blend_weight * similarity * self.language_loss(feature, target, valid)
+
+
+_LANGUAGE = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
+
+
+def _filter(planes: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
+    """Gaussian window over each plane, zeros beyond the edge: columns, then rows, all planes in one convolution."""
+    count = planes.shape[0]
+    taps = _taps(planes.dtype).expand(count, 1, SSIM_WINDOW)
+    half = SSIM_WINDOW // 2
+    columns = conv2d(planes[None], taps[..., None], padding=(half, 0), groups=count)
+    return conv2d(columns, taps[:, :, None], padding=(0, half), groups=count)[0]
+
+
+@cache
+def _taps(dtype: torch.dtype) -> Float[Tensor, " taps"]:
+    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    return (weights / weights.sum()).to(dtype)
+
+
+def _filled(target: Tensor, valid: Tensor, render: Tensor) -> Tensor:
+    """The target, or where it does not count the render itself, which leaves neither an error nor a gradient."""
+    return torch.where(valid[..., None], target, render.detach())
+
+
+def _count(error: Tensor, valid: Tensor, pixels: Pixels) -> Tensor | int:
+    """How many numbers a mean is over; 1 instead of 0."""
+    if pixels == "all":
+        return error.numel()
+    return valid.sum().clamp_min(1) * error.shape[-1]
+
+
+def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"Losses: {name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _require_shapes(who: str, render: Tensor, target: Tensor, valid: Tensor | None = None) -> None:
+    if render.shape != target.shape:
+        raise ValueError(f"{who}: target must be {tuple(render.shape)}, got {tuple(target.shape)}")
+    if valid is not None and valid.shape != render.shape[:2]:
+        raise ValueError(
+            f"{who}: valid must be {tuple(render.shape[:2])}, got {tuple(valid.shape)}"
+        )
