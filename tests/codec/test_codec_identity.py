@@ -1,0 +1,23 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from vlgs.codec import Codec
+from vlgs.codec.identity import Identity
+
+
+def test_codes_are_the_embeddings():
+    codec = Identity(dim=8)
+    assert isinstance(codec, Codec)
+    vectors = normalize(torch.randn(5, 8), dim=1)
+    codec.fit(vectors, torch.ones(5))
+    assert torch.equal(codec.encode(vectors), vectors)
+    torch.testing.assert_close(codec.decode(0.3 * vectors.reshape(5, 1, 8)), vectors[:, None])
+    assert codec.decode(torch.zeros(2, 8)).eq(0).all()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="dim must be at least 1, got 0"):
+        Identity(dim=0)
+    with pytest.raises(ValueError, match="dim must be the embedding width 3, got 8"):
+        Identity(dim=8).fit(torch.ones(1, 3), torch.ones(1))

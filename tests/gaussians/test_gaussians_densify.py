@@ -1,0 +1,327 @@
+import math
+
+import jaxtyping
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from vlgs.gaussians import (
+    PARAMETERS,
+    DensifyConfig,
+    DensifyReport,
+    DensifyState,
+    GaussiansConfig,
+    activate,
+    densify,
+    reset_opacity,
+)
+from vlgs.geometry import quat_to_rotmat
+
+EXTENT = 1.0
+SMALL, MIDDLE, LARGE = 0.005, 0.05, 0.5
+EARLY, LATE = 600, 3100  # before and after the first reset
+ADAM = [{"foreach": False}, {"foreach": True}, {"fused": True}]
+
+
+def make(n: int, scale: float = SMALL, opacity: float = 0.5, indicator: float = 0.5):
+    generator = torch.Generator().manual_seed(n)
+    logit = lambda p: math.log(p / (1 - p))  # noqa: E731
+    values = {
+        "means": torch.randn(n, 3, generator=generator),
+        "quats": torch.randn(n, 4, generator=generator),
+        "log_scales": torch.full((n, 3), math.log(scale)),
+        "sh0": torch.randn(n, 3, generator=generator),
+        "shN": torch.randn(n, 3, 3, generator=generator),
+        "opacity_logits": torch.full((n,), logit(opacity)),
+        "indicator_logits": torch.full((n,), logit(indicator)),
+        "features": torch.randn(n, 2, generator=generator),
+    }
+    return nn.ParameterDict({name: nn.Parameter(values[name]) for name in PARAMETERS})
+
+
+def adam(params: nn.ParameterDict, **options) -> torch.optim.Adam:
+    groups = [{"params": [params[name]], "name": name, "lr": 1e-3} for name in PARAMETERS]
+    return torch.optim.Adam(groups, **options)
+
+
+def step_once(params: nn.ParameterDict, optimizer: torch.optim.Adam) -> None:
+    """One step with a gradient of its own for every row, so that a moment tells whose it is."""
+    for value in params.values():
+        rows = torch.arange(1.0, len(value) + 1).reshape(-1, *[1] * (value.dim() - 1))
+        value.grad = rows.expand_as(value).clone()
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+
+
+def state_of(grads: list[float]) -> DensifyState:
+    return DensifyState(torch.tensor(grads), torch.ones(len(grads)))
+
+
+def run(params, state, config=None, optimizer=None, step=EARLY, seed=0) -> DensifyReport:
+    optimizer = adam(params) if optimizer is None else optimizer
+    config = GaussiansConfig() if config is None else config
+    return densify(params, optimizer, state, config, EXTENT, seed, step)
+
+
+HOT, COLD = 1e-3, 1e-5
+
+
+def test_statistic_is_the_mean_length_over_views_in_ndc():
+    state = DensifyState.zeros(3)
+    grads = torch.tensor([[3e-3, 0.0], [0.0, 1e-3], [5.0, 5.0]])
+    state.accumulate(grads, torch.tensor([True, True, False]), width=200, height=100)
+    state.accumulate(-grads / 3, torch.tensor([True, False, False]), width=200, height=100)
+    # Row 0: lengths 0.3 and 0.1 of opposite gradients, which do not cancel. Row 2 was never seen.
+    torch.testing.assert_close(state.mean(), torch.tensor([0.2, 0.05, 0.0]))
+
+
+@pytest.mark.parametrize("options", ADAM, ids=["loop", "foreach", "fused"])
+def test_clones_copy_their_row_and_moments_stay_with_their_gaussians(options: dict):
+    params = make(20)
+    optimizer = adam(params, **options)
+    step_once(params, optimizer)
+    before = {name: value.detach().clone() for name, value in params.items()}
+    report = run(params, state_of([COLD] * 18 + [HOT, COLD]), optimizer=optimizer)
+    assert report == DensifyReport(cloned=1, split=0, pruned=0, count=21)
+    rows = torch.tensor([*range(20), 18])
+    for group in optimizer.param_groups:
+        value = params[group["name"]]
+        assert group["params"] == [value]
+        assert torch.equal(value, before[group["name"]][rows])
+        moments = optimizer.state[value]
+        want = 0.1 * (rows + 1.0)
+        want[20] = 0
+        first = moments["exp_avg"].flatten(1)[:, 0] if value.dim() > 1 else moments["exp_avg"]
+        torch.testing.assert_close(first, want)
+        assert moments["exp_avg_sq"][20].eq(0).all()
+        assert moments["step"].item() == 1
+    assert len(optimizer.state) == len(PARAMETERS)
+    step_once(params, optimizer)
+    assert all(value.isfinite().all() for value in params.values())
+
+
+def test_pruned_rows_take_their_moments_with_them():
+    params = make(20)
+    optimizer = adam(params)
+    step_once(params, optimizer)
+    with torch.no_grad():
+        params["opacity_logits"][3] = params["indicator_logits"][3] = -9.0
+    report = run(params, state_of([COLD] * 20), optimizer=optimizer)
+    assert report == DensifyReport(cloned=0, split=0, pruned=1, count=19)
+    moments = optimizer.state[params["indicator_logits"]]["exp_avg"]
+    torch.testing.assert_close(moments, 0.1 * torch.tensor([1.0, 2, 3, *range(5, 21)]))
+
+
+def test_split_replaces_the_parent_by_two_smaller_ones_drawn_from_it():
+    n = 2000
+    params = make(n, scale=MIDDLE)
+    with torch.no_grad():
+        params["log_scales"] += torch.tensor([0.0, -1.0, -2.0])
+        params["means"][:] = params["means"][0]
+        params["quats"][:] = params["quats"][0]
+    mean, rotation = params["means"][0].clone(), quat_to_rotmat(params["quats"][0]).detach()
+    scales = params["log_scales"][0].exp().detach()
+    assert run(params, state_of([HOT] * n)) == DensifyReport(0, n, 0, 2 * n)
+    torch.testing.assert_close(params["log_scales"].detach().exp(), (scales / 1.6).expand(2 * n, 3))
+    local = (params["means"].detach() - mean) @ rotation / scales
+    torch.testing.assert_close(local.T.cov(), torch.eye(3), rtol=0, atol=0.08)
+    torch.testing.assert_close(local.mean(0), torch.zeros(3), rtol=0, atol=0.08)
+    assert torch.equal(params["features"][:n], params["features"][n:])
+
+
+def test_only_the_opacity_counts_when_asked():
+    glass = {"opacity": 1e-3, "indicator": 0.9}
+    kept, removed = make(40, **glass), make(40, **glass)
+    with torch.no_grad():
+        removed["opacity_logits"][:20] = 0.0
+    assert run(kept, state_of([COLD] * 40)).pruned == 0
+    report = run(removed, state_of([COLD] * 40), GaussiansConfig(prune_on="opacity"))
+    assert (report.pruned, report.count) == (20, 20)
+
+
+def test_large_ones_go_only_after_the_first_reset():
+    early, late, never = make(40, LARGE), make(40, LARGE), make(40, LARGE)
+    for params in (early, late, never):
+        with torch.no_grad():
+            params["log_scales"][:20] = math.log(SMALL)
+    assert run(early, state_of([COLD] * 40)).pruned == 0
+    assert run(late, state_of([COLD] * 40), step=LATE).pruned == 20
+    config = GaussiansConfig(densify=DensifyConfig(prune_large=False))
+    assert run(never, state_of([COLD] * 40), config, step=LATE).pruned == 0
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+def test_broken_gaussians_are_removed(name: str, poison: float):
+    params = make(20)
+    with torch.no_grad():
+        params[name].view(20, -1)[7, -1] = poison
+    report = run(params, state_of([HOT] * 20))
+    assert report == DensifyReport(cloned=19, split=0, pruned=1, count=38)
+    assert all(value.isfinite().all() for value in params.values())
+
+
+@pytest.mark.parametrize(("name", "value"), [("quats", 0.0), ("log_scales", 200.0)])
+def test_finite_but_impossible_gaussians_are_removed(name: str, value: float):
+    params = make(20)
+    with torch.no_grad():
+        params[name][7] = value
+    assert run(params, state_of([COLD] * 20)).pruned == 1
+
+
+def test_something_is_always_left(caplog: pytest.LogCaptureFixture):
+    params = make(50, opacity=1e-3, indicator=1e-3)
+    with torch.no_grad():
+        params["opacity_logits"][30:] += 0.1  # still below the threshold, but the best there is
+    wanted = params["means"][30:46].clone()
+    assert run(params, state_of([COLD] * 50)).count == 16
+    assert torch.equal(params["means"], wanted)
+    assert "16 are kept" in caplog.text
+    giants = make(50, scale=LARGE)
+    assert run(giants, state_of([COLD] * 50), step=LATE).count == 16
+
+
+def test_highest_gradients_go_first_when_room_is_short():
+    params = make(20)
+    grads = [HOT * (1 + i) for i in range(20)]
+    report = run(params, state_of(grads), GaussiansConfig(max_count=23))
+    assert report == DensifyReport(3, 0, 0, 23)
+    assert torch.equal(params["means"][20:], params["means"][17:20])
+
+
+@given(
+    n=st.integers(1, 60),
+    seed=st.integers(0, 1000),
+    max_count=st.integers(1, 90),
+    step=st.sampled_from([EARLY, LATE]),
+    prune_on=st.sampled_from(["max", "opacity"]),
+)
+@settings(max_examples=60, deadline=None)
+def test_invariants(n: int, seed: int, max_count: int, step: int, prune_on):
+    generator = torch.Generator().manual_seed(seed)
+    config = GaussiansConfig(max_count=max_count, prune_on=prune_on)
+    reports, results = [], []
+    draws = {
+        "log_scales": torch.randn(n, 3, generator=generator) * 2 - 4,
+        "opacity_logits": torch.randn(n, generator=generator) * 5,
+        "indicator_logits": torch.randn(n, generator=generator) * 5,
+    }
+    grads = torch.rand(n, generator=generator) * 4e-4
+    for _ in range(2):
+        params = make(n)
+        with torch.no_grad():
+            for name, value in draws.items():
+                params[name].copy_(value)
+        optimizer = adam(params)
+        step_once(params, optimizer)
+        state = DensifyState(grads.clone(), torch.ones(n))
+        reports.append(densify(params, optimizer, state, config, EXTENT, seed, step))
+        results.append(params)
+        assert torch.equal(state.grad_sum, torch.zeros(reports[-1].count))
+        assert torch.equal(state.count, torch.zeros(reports[-1].count))
+    first, again = results
+    report = reports[0]
+    assert report == reports[1]
+    assert all(torch.equal(first[name], again[name]) for name in PARAMETERS)
+    assert report.count == n + report.cloned + report.split - report.pruned
+    assert min(n, 16) <= report.count <= max(n, max_count)
+    assert all(len(value) == report.count for value in first.values())
+    assert all(value.isfinite().all() and value.requires_grad for value in first.values())
+
+
+def test_draws_depend_on_seed_and_step_and_on_nothing_else():
+    def means(seed: int, step: int) -> torch.Tensor:
+        params = make(20, scale=MIDDLE)
+        run(params, state_of([HOT] * 20), step=step, seed=seed)
+        return params["means"].detach()
+
+    before = torch.get_rng_state()
+    first = means(0, EARLY)
+    assert torch.equal(before, torch.get_rng_state())
+    torch.rand(3)
+    assert torch.equal(first, means(0, EARLY))
+    assert not torch.equal(first, means(1, EARLY))
+    assert not torch.equal(first, means(0, EARLY + 100))
+
+
+def test_entries_without_a_group_and_frozen_ones_follow():
+    params = make(20)
+    params["features"].requires_grad_(False)
+    optimizer = torch.optim.Adam([{"params": [params["means"]], "name": "means"}])
+    assert run(params, state_of([HOT] * 20), optimizer=optimizer).count == 40
+    assert params["features"].shape == (40, 2)
+    assert not params["features"].requires_grad
+    assert params["means"].requires_grad
+
+
+@pytest.mark.parametrize("reset_indicator", [False, True])
+def test_reset_lowers_opacity_and_forgets_its_moments(reset_indicator: bool):
+    params = make(3)
+    with torch.no_grad():
+        params["opacity_logits"][0] = params["indicator_logits"][0] = -6.0
+    optimizer = adam(params)
+    step_once(params, optimizer)
+    kept = params["opacity_logits"][0].item()
+    before = activate(params)
+    config = GaussiansConfig(densify=DensifyConfig(reset_indicator=reset_indicator))
+    reset_opacity(params, optimizer, config)
+    after = activate(params)
+    assert params["opacity_logits"][0].item() == kept
+    torch.testing.assert_close(after.opacities[1:], torch.full((2,), 0.01))
+    assert optimizer.state[params["opacity_logits"]]["exp_avg"].eq(0).all()
+    assert optimizer.state[params["opacity_logits"]]["exp_avg_sq"].eq(0).all()
+    assert optimizer.state[params["means"]]["exp_avg"].ne(0).all()
+    assert torch.equal(after.indicators, before.indicators) != reset_indicator
+    assert optimizer.state[params["indicator_logits"]]["exp_avg"].eq(0).all() == reset_indicator
+
+
+def test_schedule():
+    config = DensifyConfig()
+    due = [step for step in range(20_000) if config.densifies_at(step)]
+    assert (due[0], due[-1], len(due)) == (600, 14_900, 144)
+    resets = [step for step in range(20_000) if config.resets_at(step)]
+    assert resets == [3000, 6000, 9000, 12_000]
+    assert not DensifyConfig(reset_every=0).resets_at(3000)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"every": 0}, {"start": -1}, {"grad_threshold": 0.0}, {"dense_share": math.nan}, {"prune_below": 1.0},
+        {"reset_to": 0.004}, {"max_scale_share": math.inf}, {"reset_every": -1},
+    ],
+)  # fmt: skip
+def test_bad_densify_config(options: dict):
+    with pytest.raises(ValueError, match=f"densify: {next(iter(options))} must be"):
+        DensifyConfig(**options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"sh_degree": 4},
+        {"init_opacity": 1.0},
+        {"max_count": 0},
+        {"prune_on": "x"},
+        {"densify_on": "x"},
+    ],
+)
+def test_bad_gaussians_config(options: dict):
+    jaxtyping.config.update("jaxtyping_disable", True)  # the run-time types would speak first
+    try:
+        with pytest.raises(ValueError, match=f"gaussians: {next(iter(options))} must be"):
+            GaussiansConfig(**options)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_bad_calls():
+    params = make(20)
+    with pytest.raises(ValueError, match="state must have 20 rows, got 3"):
+        run(params, state_of([0.0] * 3))
+    with torch.no_grad():
+        params["means"].fill_(math.nan)
+    with pytest.raises(ValueError, match="must be finite, got none"):
+        run(params, state_of([0.0] * 20))

@@ -1,0 +1,41 @@
+"""The codec that changes nothing: Gaussians carry the embeddings themselves."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+
+class Identity(nn.Module):
+    """Codes are the embeddings (d = e), for lifting and for judging what compression costs.
+
+    Args:
+        dim: Embedding width e; 512 for CLIP ViT-B/16.
+
+    Raises:
+        ValueError: If `dim` is not positive.
+    """
+
+    def __init__(self, dim: int = 512) -> None:
+        super().__init__()
+        if dim < 1:
+            raise ValueError(f"identity codec: dim must be at least 1, got {dim}")
+        self.dim = dim
+
+    def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
+        """Check that the embeddings have the width that was announced.
+
+        Raises:
+            ValueError: If they have another one.
+        """
+        if vectors.shape[1] != self.dim:
+            raise ValueError(
+                f"identity codec: dim must be the embedding width {vectors.shape[1]}, got {self.dim}"
+            )
+
+    def encode(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m e"]:
+        """The embeddings as they are."""
+        return vectors
+
+    def decode(self, codes: Float[Tensor, "*b e"]) -> Float[Tensor, "*b e"]:
+        """Unit length again, which blending does not keep."""
+        return normalize(codes, dim=-1, eps=1e-6)

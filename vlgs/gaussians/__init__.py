@@ -1,0 +1,25 @@
+"""Gaussians: parameters, initialisation, spherical harmonics, densification and PLY files."""
+
+from vlgs.gaussians.config import DensifyConfig, GaussiansConfig
+from vlgs.gaussians.densify import DensifyReport, DensifyState, densify, reset_opacity
+from vlgs.gaussians.init import initialise
+from vlgs.gaussians.parameters import PARAMETERS, activate
+from vlgs.gaussians.ply import read_ply, write_ply
+from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color_residual
+
+__all__ = [
+    "PARAMETERS",
+    "DensifyConfig",
+    "DensifyReport",
+    "DensifyState",
+    "GaussiansConfig",
+    "activate",
+    "densify",
+    "initialise",
+    "read_ply",
+    "reset_opacity",
+    "rgb_to_sh",
+    "sh_to_rgb",
+    "view_color_residual",
+    "write_ply",
+]

@@ -1,0 +1,116 @@
+"""Settings of the Gaussians: how they start, multiply and die. Mirrored by conf/gaussians."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """Adaptive density control (3DGS; systems.md A.1, D.10, D.11). Steps count from 0."""
+
+    start: int = 500
+    """No densification up to and including this step."""
+    stop: int = 15_000
+    """Neither densification nor opacity resets from this step on."""
+    every: int = 100
+    """Steps between two densifications."""
+    grad_threshold: float = 2e-4
+    """A Gaussian whose mean screen gradient reaches this, in NDC units, is cloned or split."""
+    dense_share: float = 0.01
+    """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
+    prune_below: float = 0.005
+    """Weight under which a Gaussian is removed; see `GaussiansConfig.prune_on`."""
+    prune_large: bool = True
+    """Whether Gaussians above `max_scale_share` are removed, once the first opacity reset has passed."""
+    max_scale_share: float = 0.1
+    """Largest scale of a Gaussian as a share of the scene extent."""
+    reset_every: int = 3000
+    """Steps between two opacity resets; 0 never resets."""
+    reset_to: float = 0.01
+    """A reset lowers every opacity to this at most."""
+    reset_indicator: bool = False
+    """Whether a reset lowers the indicators as well."""
+
+    def __post_init__(self) -> None:
+        _require_at_least("densify", 1, every=self.every)
+        _require_at_least("densify", 0, start=self.start, stop=self.stop)
+        _require_at_least("densify", 0, reset_every=self.reset_every)
+        _require_positive(
+            "densify",
+            grad_threshold=self.grad_threshold,
+            dense_share=self.dense_share,
+            max_scale_share=self.max_scale_share,
+        )
+        _require_inside_unit("densify", prune_below=self.prune_below, reset_to=self.reset_to)
+        if self.reset_to <= self.prune_below:
+            raise ValueError(
+                f"densify: reset_to must be above prune_below ({self.prune_below}), or a reset kills every "
+                f"Gaussian, got {self.reset_to}"
+            )
+
+    def densifies_at(self, step: int) -> bool:
+        """Whether Gaussians are cloned, split and pruned after this step."""
+        return self.start < step < self.stop and step % self.every == 0
+
+    def resets_at(self, step: int) -> bool:
+        """Whether opacities are lowered after this step (after densifying, if both are due)."""
+        return 0 < step < self.stop and self.reset_every > 0 and step % self.reset_every == 0
+
+
+@dataclass(frozen=True)
+class GaussiansConfig:
+    """What the Gaussians of a scene carry and how they start."""
+
+    sh_degree: int = 3
+    """Highest spherical harmonics degree that is stored, 0 to 3."""
+    init_opacity: float = 0.1
+    init_indicator: float = 0.1
+    """The paper starts the indicator in the same manner as the opacity (systems.md A.11)."""
+    init_points: int = 20_000
+    """Random points for a scene without sparse points."""
+    max_init_angle: float = 0.1
+    """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
+    the cameras and the scene would otherwise cover whole views."""
+    max_count: int = 200_000
+    """Sparse points beyond this are left out, and densification stops growing here."""
+    prune_on: Literal["max", "opacity"] = "max"
+    """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
+    reading of the paper (systems.md D.10)."""
+    densify_on: Literal["total", "rgb"] = "total"
+    """Loss whose screen gradients feed densification (systems.md D.11)."""
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+
+    def __post_init__(self) -> None:
+        if self.sh_degree not in range(4):
+            raise ValueError(f"gaussians: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
+        _require_inside_unit(
+            "gaussians", init_opacity=self.init_opacity, init_indicator=self.init_indicator
+        )
+        _require_at_least("gaussians", 1, init_points=self.init_points, max_count=self.max_count)
+        _require_positive("gaussians", max_init_angle=self.max_init_angle)
+        for name, options in {
+            "prune_on": ("max", "opacity"),
+            "densify_on": ("total", "rgb"),
+        }.items():
+            if getattr(self, name) not in options:
+                raise ValueError(
+                    f"gaussians: {name} must be {' or '.join(options)}, got {getattr(self, name)}"
+                )
+
+
+def _require_at_least(who: str, least: int, **values: int) -> None:
+    for name, value in values.items():
+        if value < least:
+            raise ValueError(f"{who}: {name} must be at least {least}, got {value}")
+
+
+def _require_positive(who: str, **values: float) -> None:
+    for name, value in values.items():
+        if not 0.0 < value < float("inf"):
+            raise ValueError(f"{who}: {name} must be positive and finite, got {value}")
+
+
+def _require_inside_unit(who: str, **values: float) -> None:
+    for name, value in values.items():
+        if not 0.0 < value < 1.0:
+            raise ValueError(f"{who}: {name} must be between 0 and 1, got {value}")

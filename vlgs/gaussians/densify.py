@@ -1,0 +1,274 @@
+"""Adaptive density control: clone, split, prune and reset (3DGS; systems.md A.1, D.10, D.11)."""
+
+import logging
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from vlgs.gaussians.config import GaussiansConfig
+from vlgs.gaussians.init import seeded_generator
+from vlgs.gaussians.parameters import logit
+from vlgs.geometry import quat_to_rotmat
+
+log = logging.getLogger(__name__)
+
+CHILDREN = 2
+"""Gaussians that a split one is replaced by."""
+SHRINK = 1.6
+"""Their scales are the parent's divided by this (3DGS: 0.8 times the number of children)."""
+MIN_COUNT = 16
+"""Pruning leaves at least this many, so that a bad step cannot end a run with an empty scene."""
+
+
+@dataclass
+class DensifyState:
+    """Screen-space gradients of the Gaussians since the last densification."""
+
+    grad_sum: Float[Tensor, " n"]
+    """Sum over the views that saw a Gaussian of the length of its gradient, in NDC units."""
+    count: Float[Tensor, " n"]
+    """Number of those views."""
+
+    @classmethod
+    def zeros(cls, n: int) -> "DensifyState":
+        """The state before the first view."""
+        return cls(torch.zeros(n), torch.zeros(n))
+
+    def accumulate(
+        self,
+        mean2d_grad: Float[Tensor, "n 2"],
+        visible: Bool[Tensor, " n"],
+        width: int,
+        height: int,
+    ) -> None:
+        """Add one real view; gradients of several views are never summed before their length is taken (D.11).
+
+        Args:
+            mean2d_grad: Gradient of the loss with respect to `Rendered.mean2d`, per pixel.
+            visible: `Rendered.visible` of the same view.
+            width: Of the image in pixels; half of it is one NDC unit.
+            height: Likewise.
+        """
+        half_image = mean2d_grad.new_tensor([width / 2, height / 2])
+        length = (mean2d_grad * half_image).norm(dim=-1)
+        self.grad_sum += torch.where(visible, length, 0.0)
+        self.count += visible
+
+    def mean(self) -> Float[Tensor, " n"]:
+        """Mean length of the gradient over the views that saw a Gaussian; 0 where none did."""
+        return self.grad_sum / self.count.clamp_min(1)
+
+    def restart(self, n: int) -> None:
+        """Forget everything and make room for n Gaussians."""
+        self.grad_sum, self.count = torch.zeros(n), torch.zeros(n)
+
+
+@dataclass(frozen=True)
+class DensifyReport:
+    """What one densification did: count = count before + cloned + split - pruned."""
+
+    cloned: int
+    split: int
+    """Parents that were replaced by two children."""
+    pruned: int
+    """Gaussians removed, without the split parents."""
+    count: int
+    """Gaussians afterwards."""
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The next generation in terms of the present one."""
+
+    source: Int[Tensor, " m"]
+    """Row that each new row copies."""
+    fresh: Bool[Tensor, " m"]
+    """Rows that start with zero Adam moments: clones and children."""
+    child: Bool[Tensor, " m"]
+
+    def __getitem__(self, kept: Bool[Tensor, " m"]) -> "_Rows":
+        return _Rows(self.source[kept], self.fresh[kept], self.child[kept])
+
+
+def densify(
+    params: nn.ParameterDict,
+    optimizer: torch.optim.Optimizer,
+    state: DensifyState,
+    config: GaussiansConfig,
+    extent: float,
+    seed: int,
+    step: int,
+) -> DensifyReport:
+    """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
+
+    Parameters are replaced in `params` and in the optimiser's groups of the same name; Adam's moments follow their
+    Gaussian and are zero for new ones. `state` restarts at zero. The result is a function of the arguments alone.
+
+    Args:
+        params: Raw parameters; every entry has one row per Gaussian.
+        optimizer: Adam with one parameter per group and `group["name"]` equal to the key in `params`.
+        state: Gradients accumulated since the last call.
+        config: Thresholds; `max_count` stops growth, the highest mean gradients going first.
+        extent: `vlgs.geometry.scene_extent` of the training cameras, world units.
+        seed: Of the run.
+        step: Of the run; large Gaussians are spared until the first opacity reset has passed.
+
+    Raises:
+        ValueError: If `state` has another size than `params`, or no Gaussian is finite.
+    """
+    n = params["means"].shape[0]
+    if state.grad_sum.shape[0] != n:
+        raise ValueError(f"densify: state must have {n} rows, got {state.grad_sum.shape[0]}")
+    with torch.no_grad():
+        dead = _dead(params, config)
+        grow = _hot(state, config) & ~dead
+        grow = _highest(grow, state.mean(), config.max_count - int((~dead).sum()))
+        small = params["log_scales"].amax(dim=1).exp() <= config.densify.dense_share * extent
+        rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
+        values = {name: value[rows.source] for name, value in params.items()}
+        _place_children(values, rows, seeded_generator("densify", seed, step))
+        kept = _not_large(values["log_scales"], config, extent, step)
+        if not kept.all():
+            rows, values = rows[kept], {name: value[kept] for name, value in values.items()}
+    _replace(params, optimizer, values, rows)
+    state.restart(rows.source.shape[0])
+    cloned, split, count = int((grow & small).sum()), int((grow & ~small).sum()), len(rows.source)
+    return DensifyReport(cloned, split, pruned=n + cloned + split - count, count=count)
+
+
+def reset_opacity(
+    params: nn.ParameterDict, optimizer: torch.optim.Optimizer, config: GaussiansConfig
+) -> None:
+    """Lower every opacity to `reset_to` at most and forget its Adam moments, in place.
+
+    Indicators stay as they are unless `reset_indicator` (systems.md D.10).
+    """
+    names = ["opacity_logits"]
+    if config.densify.reset_indicator:
+        names.append("indicator_logits")
+    for name in names:
+        with torch.no_grad():
+            params[name].clamp_(max=logit(config.densify.reset_to))
+        for moment in _moments(optimizer, params[name]).values():
+            moment.zero_()
+
+
+def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
+    """Gaussians that no image would miss, and those that are not Gaussians at all."""
+    weight = params["opacity_logits"].sigmoid()
+    if config.prune_on == "max":
+        weight = weight.maximum(params["indicator_logits"].sigmoid())
+    # A scale that overflows and a rotation of length zero are as broken as a NaN.
+    finite = params["log_scales"].exp().isfinite().all(dim=1) & (params["quats"].norm(dim=1) > 0)
+    for value in params.values():
+        finite &= value.isfinite().flatten(1).all(dim=1) if value.dim() > 1 else value.isfinite()
+    if not finite.any():
+        raise ValueError("densify: Gaussians must be finite, got none that is")
+    if not finite.all():
+        log.warning("densify: %d of %d Gaussians are not finite", int((~finite).sum()), len(finite))
+    return _spare(weight < config.densify.prune_below, weight, finite) | ~finite
+
+
+def _spare(
+    doomed: Bool[Tensor, " n"], merit: Float[Tensor, " n"], finite: Bool[Tensor, " n"] | None = None
+) -> Bool[Tensor, " n"]:
+    """Take the best of the doomed back where fewer than `MIN_COUNT` would be left."""
+    able = torch.ones_like(doomed) if finite is None else finite
+    alive = int((able & ~doomed).sum())
+    floor = min(MIN_COUNT, int(able.sum()))
+    if alive >= floor:
+        return doomed
+    log.warning("densify: %d Gaussians would be left, %d are kept", alive, floor)
+    best = _highest(doomed & able, merit, floor - alive)
+    return doomed & ~best
+
+
+def _hot(state: DensifyState, config: GaussiansConfig) -> Bool[Tensor, " n"]:
+    return (state.mean() >= config.densify.grad_threshold) & (state.count > 0)
+
+
+def _highest(
+    candidates: Bool[Tensor, " n"], merit: Float[Tensor, " n"], room: int
+) -> Bool[Tensor, " n"]:
+    """At most `room` of the candidates, those of highest merit; the earlier row where it is equal."""
+    if int(candidates.sum()) <= room:
+        return candidates
+    rows = candidates.nonzero().squeeze(1)
+    best = rows[merit[rows].argsort(descending=True, stable=True)[: max(room, 0)]]
+    return torch.zeros_like(candidates).index_fill_(0, best, True)
+
+
+def _next_generation(
+    dead: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], split: Bool[Tensor, " n"]
+) -> _Rows:
+    survivors = (~dead & ~split).nonzero().squeeze(1)
+    clones = clone.nonzero().squeeze(1)
+    children = split.nonzero().squeeze(1).repeat(CHILDREN)
+    counts = torch.tensor([len(survivors), len(clones), len(children)])
+    fresh = torch.tensor([False, True, True]).repeat_interleave(counts)
+    child = torch.tensor([False, False, True]).repeat_interleave(counts)
+    return _Rows(torch.cat([survivors, clones, children]), fresh, child)
+
+
+def _place_children(values: dict[str, Tensor], rows: _Rows, generator: torch.Generator) -> None:
+    """Draw the centres of the children from their parent and shrink them, in place."""
+    log_scales = values["log_scales"][rows.child]
+    offsets = log_scales.exp() * torch.randn(
+        log_scales.shape, generator=generator, dtype=log_scales.dtype
+    )
+    rotation = quat_to_rotmat(values["quats"][rows.child])
+    values["means"][rows.child] += (rotation @ offsets[..., None]).squeeze(-1)
+    values["log_scales"][rows.child] = log_scales - math.log(SHRINK)
+
+
+def _not_large(
+    log_scales: Float[Tensor, "n 3"], config: GaussiansConfig, extent: float, step: int
+) -> Bool[Tensor, " n"]:
+    """Gaussians that stay, once large ones are looked for.
+
+    3DGS also names a radius of 20 px on the screen; its code as released clears the radii just before it looks at
+    them, so that only the size in the world ever counted. That is what is done here.
+    """
+    largest = log_scales.amax(dim=1).exp()
+    first_reset = config.densify.reset_every
+    if not config.densify.prune_large or first_reset == 0 or step <= first_reset:
+        return torch.ones_like(largest, dtype=torch.bool)
+    return ~_spare(largest > config.densify.max_scale_share * extent, -largest)
+
+
+def _replace(
+    params: nn.ParameterDict,
+    optimizer: torch.optim.Optimizer,
+    values: dict[str, Tensor],
+    rows: _Rows,
+) -> None:
+    """Put new tensors in the place of the parameters, here and in the optimiser, with the moments of their rows."""
+    groups = {group.get("name"): group for group in optimizer.param_groups}
+    for name, value in values.items():
+        old = params[name]
+        new = nn.Parameter(value, requires_grad=old.requires_grad)
+        params[name] = new
+        if name not in groups:
+            continue
+        moments = _moments(optimizer, old)
+        kept = optimizer.state.pop(old, {})
+        for key, moment in moments.items():
+            moved = moment[rows.source]
+            moved[rows.fresh] = 0
+            kept[key] = moved
+        groups[name]["params"] = [new]
+        if kept:
+            optimizer.state[new] = kept
+
+
+def _moments(optimizer: torch.optim.Optimizer, parameter: Tensor) -> dict[str, Tensor]:
+    """The optimiser's tensors with one entry per entry of the parameter; a step count is not one of them."""
+    state = optimizer.state.get(parameter, {})
+    return {
+        key: value
+        for key, value in state.items()
+        if isinstance(value, Tensor) and value.dim() > 0 and value.shape == parameter.shape
+    }

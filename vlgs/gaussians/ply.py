@@ -1,0 +1,134 @@
+"""Gaussians as a 3DGS ``point_cloud.ply`` (systems.md C.6), with language codes and indicators appended."""
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor, nn
+
+from vlgs.files import write_atomically
+
+SH_COEFFICIENTS = (0, 3, 8, 15)
+"""Coefficients per colour channel above degree 0, for degrees 0 to 3."""
+
+
+def write_ply(path: str | Path, params: nn.ParameterDict | Mapping[str, Tensor]) -> None:
+    """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
+
+    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator``; readers that look properties up by
+    name pass over them. The file is complete or the one before stays.
+
+    Args:
+        path: The file; its folder must exist.
+        params: The keys of `vlgs.gaussians.PARAMETERS`.
+
+    Raises:
+        ValueError: If a value is not finite or a quaternion is zero; names the parameter and how many rows.
+        OSError: If the file cannot be written.
+    """
+    columns = {name: value.detach().to(torch.float32) for name, value in params.items()}
+    _check(f"ply {path}", columns)
+    named: list[tuple[str, Tensor]] = []
+    _append(named, ("x", "y", "z"), columns["means"])
+    _append(named, ("nx", "ny", "nz"), torch.zeros_like(columns["means"]))
+    _append(named, _numbered("f_dc", 3), columns["sh0"])
+    rest = columns["shN"].transpose(1, 2).flatten(1)  # all of red, then green, then blue
+    _append(named, _numbered("f_rest", rest.shape[1]), rest)
+    _append(named, ("opacity",), columns["opacity_logits"][:, None])
+    _append(named, _numbered("scale", 3), columns["log_scales"])
+    _append(named, _numbered("rot", 4), columns["quats"])
+    _append(named, _numbered("lang", columns["features"].shape[1]), columns["features"])
+    _append(named, ("indicator",), columns["indicator_logits"][:, None])
+    vertices = np.empty(len(columns["means"]), dtype=[(name, "<f4") for name, _ in named])
+    for name, column in named:
+        vertices[name] = column.numpy()
+    stream = io.BytesIO()
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(stream)
+    write_atomically(Path(path), stream.getvalue())
+
+
+def read_ply(path: str | Path, feature_dim: int = 3) -> dict[str, Tensor]:
+    """Raw parameters of a 3DGS file of any spherical harmonics degree, keyed by `vlgs.gaussians.PARAMETERS`.
+
+    Properties are looked up by name. Without an indicator the opacity's logit takes its place.
+
+    Args:
+        path: The file.
+        feature_dim: Width of the language codes, all zero, where the file has none.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not a PLY file, is cut short, lacks a property, or holds a value that is not finite or a
+            quaternion that is zero; names the file and what is wrong.
+    """
+    path = Path(path)
+    vertices = _read_vertices(path)
+    present = set(vertices.dtype.names or ())
+    n_rest = sum(name.startswith("f_rest_") for name in present)
+    if n_rest not in [3 * count for count in SH_COEFFICIENTS]:
+        raise ValueError(f"ply {path}: f_rest properties must be 0, 9, 24 or 45, got {n_rest}")
+    n_lang = sum(name.startswith("lang_") for name in present)
+
+    def take(*names: str) -> Float32[Tensor, "n c"]:
+        columns = np.empty((len(vertices), len(names)), np.float32)
+        for index, name in enumerate(names):
+            if name not in present or vertices.dtype[name].kind not in "fiu":
+                raise ValueError(
+                    f"ply {path}: vertex must have the numeric property {name}, got none"
+                )
+            # A double beyond float32 becomes inf, which is refused below.
+            with np.errstate(over="ignore"):
+                columns[:, index] = vertices[name]
+        return torch.from_numpy(columns)
+
+    opacity = take("opacity")[:, 0]
+    codes = take(*_numbered("lang", n_lang)) if n_lang else torch.zeros(len(vertices), feature_dim)
+    params = {
+        "means": take("x", "y", "z"),
+        "quats": take(*_numbered("rot", 4)),
+        "log_scales": take(*_numbered("scale", 3)),
+        "sh0": take(*_numbered("f_dc", 3)),
+        "shN": take(*_numbered("f_rest", n_rest)).unflatten(1, (3, n_rest // 3)).mT.contiguous(),
+        "opacity_logits": opacity,
+        "indicator_logits": take("indicator")[:, 0] if "indicator" in present else opacity.clone(),
+        "features": codes,
+    }
+    _check(f"ply {path}", params)
+    return params
+
+
+def _read_vertices(path: Path) -> np.ndarray:
+    try:
+        ply = PlyData.read(str(path))  # mapped; the columns are copied before this module returns
+    except (PlyParseError, UnicodeDecodeError, ValueError, MemoryError, OverflowError) as error:
+        raise ValueError(f"ply {path}: must be a complete PLY file, got {error}") from error
+    if "vertex" not in ply:
+        raise ValueError(f"ply {path}: must have an element vertex, got {[e.name for e in ply]}")
+    return ply["vertex"].data
+
+
+def _numbered(stem: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{stem}_{index}" for index in range(count))
+
+
+def _append(named: list[tuple[str, Tensor]], names: tuple[str, ...], values: Tensor) -> None:
+    named.extend(zip(names, values.unbind(1), strict=True))
+
+
+def _check(who: str, params: Mapping[str, Tensor]) -> None:
+    for name, value in params.items():
+        broken = ~value.isfinite()
+        bad = int((broken if broken.dim() == 1 else broken.flatten(1).any(dim=1)).sum())
+        if bad:
+            raise ValueError(
+                f"{who}: {name} must be finite, got {bad} of {len(value)} rows that are not"
+            )
+    zero = int((params["quats"].norm(dim=1) == 0).sum())
+    if zero:
+        raise ValueError(
+            f"{who}: quats must not be zero, got {zero} of {len(params['quats'])} rows that are"
+        )
