@@ -1,0 +1,126 @@
+"""Words to vectors: tables with helpful errors, and CLIP's text tower on tiny random weights without a network."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from vlgs.query import LerfRelevancy, TextEncoder, VocabSoftmax, encode_prompts
+from vlgs.query.text import ClipText, VocabularyText
+from vlgs.types import Vocabulary
+
+WORDS = ("wine glass", "steel kettle", "red apple", "Pikachu")
+
+
+def table(names: tuple[str, ...] = WORDS) -> Vocabulary:
+    return Vocabulary(names, torch.eye(len(names), 8))
+
+
+def test_vocabulary_gives_rows_in_the_order_asked():
+    got = VocabularyText(table()).encode(["red apple", "wine glass", "red apple"])
+    assert torch.equal(got, torch.eye(4, 8)[[2, 0, 2]])
+
+
+def test_unknown_word_is_named_with_close_matches_and_all_words():
+    with pytest.raises(
+        ValueError, match=r"got 'pikachu' and 1 more \(did you mean 'Pikachu'\?\)"
+    ) as e:
+        VocabularyText(table()).encode(["pikachu", "red apple", "zzz"])
+    assert "it has: wine glass, steel kettle, red apple, Pikachu" in str(e.value)
+
+
+def test_long_vocabulary_is_cut():
+    names = tuple(f"word{i}" for i in range(300))
+    with pytest.raises(ValueError, match=r"word19, \.\.\. \(300 words\)$"):
+        VocabularyText(Vocabulary(names, torch.ones(300, 2))).encode(["zzz"])
+
+
+def test_scene_without_vocabulary_says_what_to_do():
+    with pytest.raises(ValueError, match=r"set data\.vocabulary=<file> or text=clip"):
+        VocabularyText(None).encode(["red apple"])
+
+
+def test_prompts_come_with_the_negatives_of_the_query():
+    negatives = ("object", "things", "stuff", "texture")
+    got = encode_prompts(LerfRelevancy(), VocabularyText(table(WORDS + negatives)), WORDS)
+    assert got.names == WORDS
+    assert torch.equal(torch.cat([got.text, got.negatives]), torch.eye(8))
+    assert encode_prompts(VocabSoftmax(), VocabularyText(table()), WORDS).negatives.shape == (0, 8)
+
+
+def test_missing_negatives_point_to_the_query_without_any():
+    with pytest.raises(ValueError, match=r"'object' and 3 more.*query=vocab_softmax"):
+        encode_prompts(LerfRelevancy(), VocabularyText(table()), WORDS)
+
+
+def test_a_missing_prompt_is_not_blamed_on_the_negatives():
+    with pytest.raises(ValueError, match="got 'zebra'") as e:
+        encode_prompts(LerfRelevancy(), VocabularyText(table()), ["zebra"])
+    assert "vocab_softmax" not in str(e.value)
+
+
+def test_no_prompts_are_refused():
+    with pytest.raises(ValueError, match="at least one word"):
+        encode_prompts(VocabSoftmax(), VocabularyText(table()), [])
+
+
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A CLIP model of a few thousand random weights and a tokenizer of single letters."""
+    from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
+
+    folder = tmp_path_factory.mktemp("clip")
+    letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
+    tokens = [*letters, *(f"{c}</w>" for c in letters), "<|startoftext|>", "<|endoftext|>"]
+    tokenizer = CLIPTokenizer(vocab={t: i for i, t in enumerate(tokens)}, merges=[])
+    tokenizer.save_pretrained(folder)
+    small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1}
+    config = CLIPConfig(
+        text_config={
+            **small, "num_attention_heads": 2, "vocab_size": len(tokens),
+            "bos_token_id": 52, "eos_token_id": 53, "pad_token_id": 53,
+        },
+        vision_config={**small, "num_attention_heads": 2, "image_size": 8, "patch_size": 4},
+        projection_dim=12,
+    )  # fmt: skip
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        CLIPModel(config).save_pretrained(folder)
+    return folder
+
+
+def test_clip_gives_projected_unit_vectors(clip_folder: Path):
+    encoder = ClipText(model=str(clip_folder))
+    got = encoder.encode(["apple", "wine glass"])
+    assert got.shape == (2, 12)  # the projection's width, not the tower's
+    torch.testing.assert_close(got.norm(dim=-1), torch.ones(2))
+    torch.testing.assert_close(encoder.encode(["apple"])[0], got[0])  # padding leaves no trace
+    assert (got[0] - got[1]).abs().max() > 1e-3
+    assert not got.requires_grad
+
+
+def test_clip_agrees_with_the_towers_own_parts(clip_folder: Path):
+    from transformers import CLIPModel, CLIPTokenizer
+
+    clip = CLIPModel.from_pretrained(clip_folder).eval()
+    tokens = CLIPTokenizer.from_pretrained(clip_folder)(["apple"], return_tensors="pt")
+    with torch.no_grad():
+        projected = clip.text_projection(clip.text_model(**tokens).pooler_output)
+    want = torch.nn.functional.normalize(projected, dim=-1)
+    torch.testing.assert_close(ClipText(model=str(clip_folder)).encode(["apple"]), want)
+
+
+def test_clip_of_another_width_than_the_scene_is_refused(clip_folder: Path):
+    with pytest.raises(ValueError, match=r"as wide as the scene's vocabulary \(8\), got 12"):
+        ClipText(table(), str(clip_folder)).encode(["apple"])
+
+
+def test_missing_weights_are_explained(tmp_path: Path):
+    encoder = ClipText(model=str(tmp_path / "nothing"))  # loads nothing before it is asked
+    with pytest.raises(FileNotFoundError, match=r"text\.model=<folder"):
+        encoder.encode(["apple"])
+
+
+def test_encoders_keep_the_contract():
+    assert isinstance(VocabularyText(table()), TextEncoder)
+    assert isinstance(ClipText(), TextEncoder)

@@ -1,0 +1,177 @@
+"""Scores on a model whose answers are known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from report_fakes import CLASSES, Drawing, FakeModel, scene, view, vocabulary, with_test
+
+from vlgs.metrics.protocol import EvaluationProtocol
+from vlgs.query import LerfRelevancy, VocabSoftmax
+from vlgs.query.text import VocabularyText
+from vlgs.report.evaluate import Evaluation, evaluate, prompts_of
+from vlgs.report.language import LanguageTally
+from vlgs.types import IGNORE_ID, DenseLabels, ObjectLabels, Scene
+
+AUTO = EvaluationProtocol()
+OBJECTS = CLASSES[2:5]
+
+
+def score(scene: Scene, noise: float = 0.0, protocol: EvaluationProtocol = AUTO) -> Evaluation:
+    return evaluate(
+        FakeModel(noise), scene, LerfRelevancy(), VocabularyText(scene.vocabulary), protocol
+    )
+
+
+def test_the_truth_scores_one():
+    got = score(scene())
+    assert got.protocol == "dense@1 split=synthetic"
+    assert got.miou == 1
+    assert got.loc_acc == 1
+    assert got.per_category == dict.fromkeys(CLASSES[:5], 1.0) | {"absent": None}
+    assert got.beside["pixel_accuracy"] == 1
+    assert got.ssim == pytest.approx(1)
+    assert got.psnr == torch.inf
+    assert got.reasons == {}
+    assert list(got.per_view) == ["view_00", "view_01", "view_02"]
+
+
+def test_the_ceiling_is_what_exact_features_score():
+    got = score(scene())  # the model's features are exact
+    assert got.beside["miou_lerf_ovs_ceiling"] == pytest.approx(
+        got.beside["miou_lerf_ovs"], abs=0.01
+    )
+    assert got.beside["loc_acc_lerf_ovs_ceiling"] == 1
+    noisy = score(scene(), noise=1.0)
+    assert noisy.beside["miou_lerf_ovs_ceiling"] == got.beside["miou_lerf_ovs_ceiling"]
+    assert noisy.miou is not None
+    assert noisy.miou < 0.9
+
+
+def test_exact_features_are_those_of_the_true_class_and_none_where_there_is_no_class():
+    encoded, _ = prompts_of(scene(1), LerfRelevancy(), VocabularyText(vocabulary()))
+    assert encoded is not None
+    truth = torch.tensor([[2, 0, IGNORE_ID]], dtype=torch.uint8)
+    got = LanguageTally(LerfRelevancy(), encoded)._exact_relevancy(truth)
+    want = LerfRelevancy()(encoded.text[[2, 0]], encoded.text, encoded.negatives)
+    torch.testing.assert_close(got[:, 0, :2], want)
+    assert (got[:, 0, 2] == 0.5).all()
+
+
+def test_means_of_the_kinds_are_over_their_categories():
+    got = score(scene(), noise=0.5)
+    glass, steel = got.per_category["wine glass"], got.per_category["steel kettle"]
+    assert glass is not None
+    assert steel is not None
+    assert got.beside["miou_translucent_reflective"] == pytest.approx((glass + steel) / 2)
+    assert "miou_other" in got.beside
+
+
+def test_object_labels_alone_give_lerf_ovs():
+    got = score(scene(dense=False, objects=True))
+    assert got.protocol == "lerf_ovs@1 split=synthetic"
+    assert set(got.per_category) == set(OBJECTS)
+    assert (got.beside["hits"], got.beside["units"]) == (9, 9)
+    assert got.loc_acc == 1
+    assert got.miou == got.beside["miou_lerf_ovs"]
+    assert got.beside["miou_dense"] is None
+    assert got.beside["miou_lerf_ovs_ceiling"] is None
+
+
+def test_the_headline_can_be_chosen():
+    both = scene(dense=True, objects=True)
+    got = score(both, protocol=EvaluationProtocol("lerf_ovs", strict=True))
+    assert got.protocol == "lerf_ovs-strict@1 split=synthetic"
+    assert got.miou == got.beside["miou_lerf_ovs"]
+    assert got.beside["miou_dense"] == 1
+    dense = score(scene(dense=False, objects=True), protocol=EvaluationProtocol("dense"))
+    assert dense.miou is None
+    assert dense.reasons["miou"] == "no held-out view has a class for any pixel"
+
+
+def test_scene_without_labels_has_no_language_scores_and_says_why():
+    got = score(scene(dense=False))
+    assert (got.miou, got.loc_acc) == (None, None)
+    assert got.reasons["miou"] == "no held-out view has a labelled object"
+    assert got.ssim is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "classes", "reason"),
+    [
+        (None, CLASSES, "there is no text encoder"),
+        (VocabularyText(None), CLASSES, "the scene must bring a vocabulary"),
+        (VocabularyText(vocabulary(CLASSES)), CLASSES, "query=vocab_softmax"),
+        (VocabularyText(vocabulary()), (), "the scene names no classes"),
+        (VocabularyText(vocabulary()), (*CLASSES, "zebra"), "got 'zebra'"),
+    ],
+)
+def test_missing_words_cost_only_the_language_scores(
+    text: VocabularyText | None, classes: tuple[str, ...], reason: str
+):
+    where = replace(scene(1), classes=classes)
+    got = evaluate(FakeModel(), where, LerfRelevancy(), text, AUTO)
+    assert (got.miou, got.loc_acc, dict(got.per_category)) == (None, None, {})
+    assert reason in got.reasons["miou"]
+    assert got.ssim == pytest.approx(1)
+    assert prompts_of(where, LerfRelevancy(), text) == (None, got.reasons["miou"])
+
+
+def test_vocab_softmax_needs_no_negatives():
+    got = evaluate(FakeModel(), scene(1), VocabSoftmax(), VocabularyText(vocabulary(CLASSES)), AUTO)
+    assert (got.miou, got.loc_acc) == (1, 1)
+
+
+def test_no_held_out_view_scores_nothing():
+    got = score(with_test(scene()))
+    assert (got.psnr, got.ssim, got.miou, got.loc_acc) == (None, None, None, None)
+    assert got.reasons["psnr"] == "there are no held-out views"
+
+
+def test_views_that_were_trained_on_are_counted():
+    some = scene()
+    got = score(replace(some, train=some.test[:2]))
+    assert (got.beside["test_views"], got.beside["test_views_seen"]) == (3, 2)
+
+
+def test_pixels_outside_the_photograph_do_not_count():
+    drawing = Drawing()
+    valid = torch.ones(150, 200, dtype=torch.bool)
+    valid[:, :60] = False
+    wrong = drawing.ids.clone()
+    wrong[:, :60] = 5
+    black = drawing.image.clone()
+    black[:, :60] = 0
+    spoilt = replace(
+        view(drawing, "spoilt"),
+        read_image=lambda: black,
+        read_dense_labels=lambda: DenseLabels(wrong),
+        read_valid=lambda: valid,
+    )
+    got = score(with_test(scene(), spoilt))
+    assert got.miou == 1
+    assert got.per_category["absent"] is None
+    assert got.per_view["spoilt"]["psnr"] == torch.inf
+
+
+def test_empty_masks_are_reported_not_scored():
+    drawing = Drawing()
+    nothing = torch.zeros(150, 200, dtype=torch.bool)
+    masks = {**drawing.objects.masks, "red apple": nothing}
+    broken = replace(
+        view(drawing, "broken", dense=False),
+        read_object_labels=lambda: ObjectLabels(masks, drawing.objects.boxes),
+    )
+    got = score(with_test(scene(), broken))
+    assert got.per_category["red apple"] is None
+    assert got.reasons["labels"] == "empty masks were left out: red apple in broken"
+    assert got.miou is not None
+
+
+def test_labels_of_an_unknown_class_are_refused():
+    masks = {"zebra": torch.ones(150, 200, dtype=torch.bool)}
+    odd = replace(
+        view(Drawing(), "odd", dense=False), read_object_labels=lambda: ObjectLabels(masks, {})
+    )
+    with pytest.raises(ValueError, match=r"labels of view 'odd' must be among .* got \['zebra'\]"):
+        score(with_test(scene(), odd))

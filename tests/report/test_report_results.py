@@ -1,0 +1,129 @@
+"""metrics.json, where it came from, and what the terminal shows."""
+
+import io
+import json
+import math
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from vlgs.report.evaluate import Evaluation
+from vlgs.report.provenance import _cpu_model, commit, machine
+from vlgs.report.results import METRICS, metrics_table, write_metrics
+from vlgs.report.summary import print_summary
+
+EVALUATION = Evaluation(
+    protocol="dense@1 split=synthetic",
+    psnr=27.5,
+    ssim=0.91,
+    miou=0.615,
+    loc_acc=None,
+    per_category={"wine glass": 0.5, "absent": None},
+    per_view={"view_00": {"psnr": math.inf, "ssim": math.nan}},
+    beside={"miou_other": 0.7, "hits": 3},
+    reasons={"loc_acc": "no held-out view has a labelled object"},
+)
+
+
+def test_metrics_are_flat_and_strict_json(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    extra = {"seed": 3, "fps_color": math.nan, "machine": machine(), "n_gaussians": 12_345}
+    written = write_metrics(path, EVALUATION, extra)
+
+    def refuse(constant: str):
+        raise AssertionError(f"{constant} is not JSON")
+
+    assert json.loads(path.read_text(), parse_constant=refuse) == written
+    assert written["psnr"] == 27.5
+    assert written["miou_other"] == 0.7
+    assert written["seed"] == 3
+    assert written["fps_color"] is None
+    assert written["per_view"] == {"view_00": {"psnr": None, "ssim": None}}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_every_entry_is_documented(tmp_path: Path):
+    written = write_metrics(tmp_path / "m.json", EVALUATION, {"seed": 0})
+    undocumented = {name for name in set(written) - set(METRICS) if name != "miou_other"}
+    assert undocumented == set()
+    for name in METRICS:
+        assert f"| `{name}` |" in metrics_table()
+
+
+@pytest.mark.parametrize("extra", [{"psnr": 1.0}, {"fps_colour": 1.0}, {"reasons": {}}])
+def test_unknown_or_repeated_entries_are_refused(extra: dict[str, object], tmp_path: Path):
+    with pytest.raises(ValueError, match="must be listed in METRICS and new"):
+        write_metrics(tmp_path / "m.json", EVALUATION, extra)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_older_file_survives_a_failed_write(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    path.write_text("old")
+    with pytest.raises(TypeError):
+        write_metrics(path, EVALUATION, {"machine": object()})
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["old"]
+
+
+def test_summary_shows_scores_reasons_and_unbroken_paths(tmp_path: Path):
+    written = write_metrics(tmp_path / "m.json", EVALUATION, {"n_gaussians": 12_345})
+    console = Console(width=60, record=True, file=io.StringIO())
+    long_path = Path("/a/rather/long/path/to/a/run/folder/of/results/overview.png")
+    print_summary(written, {"pictures": long_path, "run": Path("/x")}, console)
+    text = console.export_text()
+    for part in ("27.50 dB", "61.5%", "12,345", "wine glass", "dense@1 split=synthetic"):
+        assert part in text
+    assert "loc_acc: no held-out view has a labelled object" in text
+    assert f"pictures  {long_path}\n" in text
+    assert [line.split() for line in text.splitlines() if "localisation" in line] == [
+        ["localisation", "accuracy", "--"]
+    ]
+
+
+def test_summary_of_nothing_at_all(tmp_path: Path):
+    empty = replace(EVALUATION, psnr=None, ssim=None, miou=None, per_category={}, beside={})
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_summary(write_metrics(tmp_path / "m.json", empty, {}), {}, console)
+    assert console.export_text().count("--") >= 4
+
+
+def git(folder: Path, *arguments: str) -> None:
+    identity = ("-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false")
+    subprocess.run(
+        ["git", "-C", str(folder), *identity, *arguments], check=True, capture_output=True
+    )
+
+
+def test_commit_of_a_checkout_and_of_an_installed_wheel(tmp_path: Path):
+    package = tmp_path / "vlgs"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    assert commit(package) is None  # no repository
+    git(tmp_path, "init")
+    assert commit(package) is None  # not tracked: a wheel inside someone's repository
+    (tmp_path / "notes.txt").write_text("")
+    git(tmp_path, "add", ".")
+    assert commit(package) is None  # no commit yet
+    git(tmp_path, "commit", "-m", "first")
+    clean = commit(package)
+    assert clean is not None
+    assert len(clean) == 40
+    (tmp_path / "notes.txt").write_text("not code")
+    assert commit(package) == clean
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "new.yaml").write_text("")
+    assert commit(package) == f"{clean}+dirty"
+    (tmp_path / "conf" / "new.yaml").unlink()
+    (package / "__init__.py").write_text("x = 1")
+    assert commit(package) == f"{clean}+dirty"
+
+
+def test_machine_is_described(tmp_path: Path):
+    assert set(machine()) == {"cpu", "cores", "threads", "torch", "python", "system"}
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text("processor\t: 0\nmodel name\t: Fast CPU @ 2.7GHz\nmodel name\t: other\n")
+    assert _cpu_model(cpuinfo) == "Fast CPU @ 2.7GHz"
+    assert _cpu_model(tmp_path / "absent")

@@ -1,0 +1,57 @@
+"""Open-vocabulary queries: decoded language features and words in, relevancy maps out."""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.query.prompts import Prompts, encode_prompts
+from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
+from vlgs.query.similarity import cosines, decoded_cosines
+from vlgs.query.text import TextEncoder
+
+__all__ = [
+    "LerfRelevancy",
+    "Prompts",
+    "Query",
+    "TextEncoder",
+    "VocabSoftmax",
+    "cosines",
+    "decoded_cosines",
+    "encode_prompts",
+]
+
+
+@runtime_checkable
+class Query(Protocol):
+    """How the cosines between a pixel and some words become the relevancy of each prompt: the whole contract.
+
+    A query is a function of cosines alone, so that decoding and the one large matrix product are shared by all queries and by
+    the class map of the same view (`vlgs.query.similarity`).
+    """
+
+    @property
+    def negatives(self) -> Sequence[str]:
+        """Words that every prompt is compared with; may be empty."""
+        ...
+
+    @property
+    def needs_all_prompts(self) -> bool:
+        """Whether prompts compete with each other, so that a prompt cannot be scored alone."""
+        ...
+
+    def relevancy(
+        self, prompts: Float[Tensor, " k *p"], negatives: Float[Tensor, " m *p"]
+    ) -> Float[Tensor, " k *p"]:
+        """Relevancy of k prompts from cosines, each in [0, 1]."""
+        ...
+
+    def __call__(
+        self,
+        features: Float[Tensor, "*p e"],
+        text: Float[Tensor, "k e"],
+        negatives: Float[Tensor, "m e"],
+    ) -> Float[Tensor, " k *p"]:
+        """Relevancy of k prompts for features of any length."""
+        ...

@@ -1,0 +1,67 @@
+"""Cosines between language features and text, for one feature or for a whole view that is never decoded at once."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SMALLEST_NORM = 1e-6
+"""Vectors shorter than this count as having no direction: their cosines fade to 0 instead of being 0/0."""
+
+CHUNK = 4096
+"""Pixels that are decoded at once: 8 MB of 512-d float32 features, which stay in cache, whatever the size of the view."""
+
+
+def cosines(features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"]) -> Float[Tensor, " k *p"]:
+    """Cosine of every text vector with every feature; a zero vector has cosine 0 with everything.
+
+    The product is taken first and divided by the norms after, which spares a normalised copy of the features.
+
+    Raises:
+        ValueError: If text and features have different widths.
+
+    Example:
+        >>> cosines(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.tensor([[2.0, 0.0]]))
+        tensor([[0.6000, 0.0000]])
+    """
+    if features.shape[-1] != text.shape[-1]:
+        raise ValueError(
+            f"query: text vectors must be as wide as the decoded features ({features.shape[-1]}), "
+            f"got {text.shape[-1]}; both must come from one embedding space"
+        )
+    flat = features.reshape(-1, features.shape[-1])
+    norms = torch.linalg.vector_norm(flat, dim=-1).clamp_min(SMALLEST_NORM)  # [p]
+    products = _unit(text.to(flat.dtype)) @ flat.T  # [k, p]
+    return (products / norms).reshape(text.shape[0], *features.shape[:-1])
+
+
+def decoded_cosines(
+    decode: Callable[[Tensor], Tensor],
+    codes: Float[Tensor, "h w d"],
+    text: Float[Tensor, "k e"],
+    chunk: int = CHUNK,
+) -> Float[Tensor, "k h w"]:
+    """Cosine of every text vector with every pixel of a rendered map of language codes.
+
+    Codes are decoded before they are compared (systems.md D.24). A view of one million pixels would be 2 GB of 512-d features;
+    here only `chunk` pixels are decoded at a time.
+
+    Args:
+        decode: Codes ``[p, d]`` to embeddings ``[p, e]``, see `vlgs.codec.Codec.decode`.
+        codes: Rendered, not normalised.
+        text: Text vectors in the embedding space of the decoder.
+        chunk: Pixels per call of `decode`.
+    """
+    h, w, _ = codes.shape
+    flat = codes.reshape(h * w, -1)
+    unit = _unit(text.to(codes.dtype))
+    out = codes.new_empty(text.shape[0], h * w)
+    for start in range(0, h * w, chunk):
+        out[:, start : start + chunk] = cosines(decode(flat[start : start + chunk]), unit)
+    return out.reshape(-1, h, w)
+
+
+def _unit(vectors: Float[Tensor, "k e"]) -> Float[Tensor, "k e"]:
+    norms = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return vectors / norms.clamp_min(SMALLEST_NORM)

@@ -1,0 +1,152 @@
+"""One held-out view as pictures: what was seen, what was rendered, what was answered."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vlgs.metrics.dense import predict_classes
+from vlgs.metrics.lerf_ovs import LANGSPLAT, Unit, box_mean, segment
+from vlgs.query import Prompts, Query
+from vlgs.report import colors
+from vlgs.report.answer import Answer, Fused, ViewModel, answer_view
+from vlgs.report.features import fit_feature_colors, paint_features
+from vlgs.report.labels import read_truth, read_units
+from vlgs.types import IGNORE_ID, Camera, Scene, View
+
+
+@dataclass(frozen=True)
+class PromptPictures:
+    """The answer to one prompt in one view."""
+
+    relevancy: UInt8[Tensor, "h w 3"]
+    """Heat map over the photograph, from the map's minimum to its maximum."""
+    segmentation: UInt8[Tensor, "h w 3"]
+    """Selected pixels, with the outline of the truth."""
+
+
+@dataclass(frozen=True)
+class ViewPictures:
+    """Everything drawn for one view."""
+
+    name: str
+    photograph: UInt8[Tensor, "h w 3"]
+    render: UInt8[Tensor, "h w 3"]
+    features: UInt8[Tensor, "h w 3"]
+    difference: UInt8[Tensor, "h w 3"]
+    """l - o as seen from the view (fig. lancity-vis)."""
+    labels: UInt8[Tensor, "h w 3"] | None = None
+    """True classes, where the view has one for every pixel."""
+    prediction: UInt8[Tensor, "h w 3"] | None = None
+    """Class with the largest cosine."""
+    classes: tuple[int, ...] = ()
+    """Ids that occur in `labels` or `prediction`."""
+    prompts: Mapping[str, PromptPictures] = field(default_factory=dict)
+    """By prompt, the most telling first."""
+
+
+class Painter:
+    """Draws views of one trained scene; feature colours mean the same in all of them.
+
+    Args:
+        model: The trained scene.
+        scene: Its held-out views and labels.
+        query: How relevancy is computed.
+        prompts: The scene's classes, encoded; without them there is nothing to answer.
+        views: The views whose features set the colours, usually those that will be drawn.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        model: ViewModel,
+        scene: Scene,
+        query: Query,
+        prompts: Prompts | None,
+        views: Sequence[View],
+    ) -> None:
+        self.model, self.scene, self.query, self.prompts = model, scene, query, prompts
+        self.fused: Fused = model.fuse()
+        self.feature_colors = fit_feature_colors(
+            answer_view(model, view.camera, None, self.fused).feature for view in views
+        )
+        self.times_asked = dict.fromkeys(scene.classes, 0)
+
+    @torch.no_grad()
+    def draw(self, view: View, max_prompts: int) -> ViewPictures:
+        """All pictures of one view; prompts that other views have shown less often come first."""
+        answer = answer_view(self.model, view.camera, self.prompts, self.fused)
+        pictures = ViewPictures(
+            name=view.name,
+            photograph=view.read_image(),
+            render=colors.to_uint8(answer.color),
+            features=paint_features(answer.feature, self.feature_colors),
+            difference=colors.diverging(self.indicator_difference(view.camera)),
+        )
+        if self.prompts is None:
+            return pictures
+        truth = read_truth(view)
+        units = self._choose(read_units(view, self.prompts.names, truth), max_prompts)
+        prompts = self._answer_prompts(answer, pictures.photograph, units)
+        pictures = replace(pictures, prompts=prompts)
+        return pictures if truth is None else self._add_classes(pictures, answer, truth)
+
+    def indicator_difference(self, camera: Camera) -> Float[Tensor, "h w"]:
+        """Mean of l - o over the Gaussians of each pixel, in [-1, 1]; 0 where there are none.
+
+        Gaussians count by the larger of l and o, so that neither glass (low o) nor glare (low l) is hidden.
+        """
+        language, color = self.fused.language_weight, self.fused.gaussians.opacities
+        values = torch.stack([language - color, torch.ones_like(color)], dim=1)
+        image = self.model.render_values(camera, values, torch.maximum(language, color))
+        return image[..., 0] / image[..., 1].clamp_min(1e-3)
+
+    def _choose(self, units: Sequence[Unit], count: int) -> list[Unit]:
+        """Prompts that tell most: rarely asked before, then of neither tiny nor view-filling objects, then glass and mirrors."""
+
+        def rank(unit: Unit) -> tuple[bool, int, bool, str]:
+            share = unit.mask.float().mean().item()
+            special = self.scene.class_kinds.get(unit.category) == "translucent_reflective"
+            telling = 0.003 <= share <= 0.25
+            return not telling, self.times_asked[unit.category], not special, unit.category
+
+        chosen = sorted(units, key=rank)[:count]
+        for unit in chosen[:1]:  # the first is what the overview shows
+            self.times_asked[unit.category] += 1
+        return chosen
+
+    def _answer_prompts(
+        self, answer: Answer, photograph: UInt8[Tensor, "h w 3"], units: Sequence[Unit]
+    ) -> dict[str, PromptPictures]:
+        assert self.prompts is not None
+        assert answer.cosines is not None  # there are prompts
+        assert answer.negatives is not None
+        relevancy = self.query.relevancy(answer.cosines, answer.negatives)
+        pictures = {}
+        for unit in units:
+            raw = relevancy[self.prompts.names.index(unit.category)]
+            blended = (
+                raw + box_mean(raw[None], LANGSPLAT.box)[0]
+            ) / 2  # what the protocol segments
+            pictures[unit.category] = PromptPictures(
+                relevancy=colors.heat_over(photograph, colors.stretch(blended)),
+                segmentation=colors.mask_over(photograph, segment(blended), unit.mask),
+            )
+        return pictures
+
+    def _add_classes(
+        self, pictures: ViewPictures, answer: Answer, truth: UInt8[Tensor, "h w"]
+    ) -> ViewPictures:
+        assert self.prompts is not None
+        assert answer.cosines is not None  # there are prompts
+        count = len(self.prompts.names)
+        prediction = predict_classes(answer.cosines)
+        shown = {*truth.unique().tolist(), *prediction.unique().tolist()} - {IGNORE_ID}
+        return replace(
+            pictures,
+            labels=colors.paint_labels(truth, count),
+            prediction=colors.paint_labels(prediction, count),
+            classes=tuple(sorted(shown)),
+        )

@@ -1,0 +1,189 @@
+"""The sheet a person would show: views as rows, what the model makes of them as columns. Matplotlib, without a display."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vlgs.report import colors
+from vlgs.report.draw import ViewPictures
+from vlgs.types import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.typing import RcKeyType
+
+STYLE: "dict[RcKeyType, Any]" = {
+    "font.family": "sans-serif",
+    "font.size": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+TILE, GAP, MARGIN = 2.2, 0.06, 0.3
+"""Width of a picture, space between pictures, space around the sheet; inches."""
+FOOT = 1.05
+"""Height of the legend, the scales and the histogram, inches."""
+DPI = 200
+PHOTOGRAPH, RENDER, FEATURES = "photograph", "render", "language features"
+LABELS, PREDICTION = "true classes", "predicted classes"
+RELEVANCY, SEGMENTATION = "relevancy of a prompt", "selected pixels, true outline"
+DIFFERENCE = "indicator \N{MINUS SIGN} opacity"
+COLUMNS = (PHOTOGRAPH, RENDER, FEATURES, LABELS, PREDICTION, RELEVANCY, SEGMENTATION, DIFFERENCE)
+
+
+def count_difference(
+    language: Float[Tensor, " n"], color: Float[Tensor, " n"], bins: int = 80
+) -> Float[Tensor, " {bins}"]:
+    """Density of l - o over all Gaussians, in equal bins from -1 to 1 (right of fig. lancity-vis).
+
+    The area under it is 1; without Gaussians it is zero.
+    """
+    counts = torch.histc((language - color).detach().float(), bins, min=-1, max=1)
+    return counts / (counts.sum().clamp_min(1) * (2 / bins))
+
+
+def write_histogram(path: Path, density: Float[Tensor, " bins"]) -> None:
+    """The histogram as a picture of its own."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(4.0, 2.4))
+        _draw_histogram(figure.add_axes((0.03, 0.2, 0.94, 0.76)), density)
+        figure.savefig(path, dpi=DPI)
+
+
+def write_overview(
+    path: Path, scene: Scene, rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
+) -> None:
+    """Draw the sheet.
+
+    Args:
+        path: Ends in .png, .pdf or another format of matplotlib's.
+        scene: Names the classes.
+        rows: At least one view. A column that no row has is left out.
+        density: Of l - o, see `count_difference`.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(STYLE):
+        _Sheet(scene, rows, density).figure.savefig(path, dpi=DPI)
+
+
+@dataclass(frozen=True)
+class _Tile:
+    picture: UInt8[Tensor, "h w 3"]
+    caption: str = ""
+
+
+def _tiles(row: ViewPictures) -> dict[str, _Tile]:
+    """Column -> picture of one row."""
+    tiles = {
+        PHOTOGRAPH: _Tile(row.photograph),
+        RENDER: _Tile(row.render),
+        FEATURES: _Tile(row.features),
+        DIFFERENCE: _Tile(row.difference),
+    }
+    if row.labels is not None and row.prediction is not None:
+        tiles |= {LABELS: _Tile(row.labels), PREDICTION: _Tile(row.prediction)}
+    if row.prompts:
+        prompt, pictures = next(iter(row.prompts.items()))
+        tiles[RELEVANCY] = _Tile(pictures.relevancy, prompt)
+        tiles[SEGMENTATION] = _Tile(pictures.segmentation, prompt)
+    return tiles
+
+
+class _Sheet:
+    """Places axes in inches from the top left, because pictures must keep their shape whatever stands around them."""
+
+    def __init__(
+        self, scene: Scene, rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
+    ) -> None:
+        from matplotlib.figure import Figure
+
+        tiles = [_tiles(row) for row in rows]
+        columns = [c for c in COLUMNS if any(c in row for row in tiles)]
+        heights = [TILE * row.photograph.shape[0] / row.photograph.shape[1] for row in rows]
+        self.width = 2 * MARGIN + len(columns) * (TILE + GAP)
+        self.height = 2 * MARGIN + sum(heights) + GAP * len(rows) + FOOT
+        self.figure = Figure(figsize=(self.width, self.height))
+        y = MARGIN
+        for i, row in enumerate(tiles):
+            for j, column in enumerate(columns):
+                if column in row:
+                    axes = self._axes(self._left(j), y, TILE, heights[i])
+                    _draw_tile(axes, row[column])
+                if i == 0:
+                    self._text(self._left(j) + TILE / 2, y - 0.12, column, size=9)
+            self._text(MARGIN - 0.13, y + heights[i] / 2, rows[i].name, size=7, rotation=90)
+            y += heights[i] + GAP
+        shown = sorted({i for row in rows for i in row.classes})
+        self._legend(scene, shown, y + 0.1, columns=len(columns) - 3)
+        if RELEVANCY in columns:
+            self._heat_scale(self._left(columns.index(RELEVANCY)), y + 0.1)
+        last = self._left(columns.index(DIFFERENCE))
+        _draw_histogram(self._axes(last, y + 0.1, TILE, FOOT - 0.35), density)
+
+    def _left(self, column: int) -> float:
+        return MARGIN + column * (TILE + GAP)
+
+    def _axes(self, x: float, y: float, width: float, height: float) -> "Axes":
+        bottom = 1 - (y + height) / self.height
+        return self.figure.add_axes(
+            (x / self.width, bottom, width / self.width, height / self.height)
+        )
+
+    def _text(self, x: float, y: float, text: str, size: int, rotation: int = 0) -> None:
+        self.figure.text(
+            x / self.width, 1 - y / self.height, text,
+            fontsize=size, rotation=rotation, ha="center", va="center",
+        )  # fmt: skip
+
+    def _legend(self, scene: Scene, classes: Sequence[int], y: float, columns: int) -> None:
+        """Colours of the class maps that occur on the sheet."""
+        from matplotlib.patches import Patch
+
+        palette = (colors.label_colors(len(scene.classes)).double() / 255).numpy()
+        handles = [Patch(color=palette[i], label=scene.classes[i]) for i in classes]
+        if handles:
+            self.figure.legend(
+                handles=handles, loc="upper left", ncols=columns, frameon=False, fontsize=8,
+                handlelength=1.2, handleheight=1.2, borderpad=0, borderaxespad=0,
+                bbox_to_anchor=(MARGIN / self.width, 1 - y / self.height),
+            )  # fmt: skip
+
+    def _heat_scale(self, x: float, y: float) -> None:
+        axes = self._axes(x + 0.3, y, TILE - 0.6, 0.1)
+        axes.imshow(colors.heat(torch.linspace(0, 1, 256)[None]).numpy(), aspect="auto")
+        axes.set(xticks=[0, 255], xticklabels=["lowest", "highest"], yticks=[])
+        axes.tick_params(length=0, labelsize=7)
+        axes.spines[:].set_visible(False)
+
+
+def _draw_tile(axes: "Axes", tile: _Tile) -> None:
+    from matplotlib.patheffects import withStroke
+
+    axes.imshow(tile.picture.numpy(), interpolation="antialiased", aspect="auto")
+    axes.set_axis_off()
+    if tile.caption:
+        axes.text(
+            0.03, 0.05, tile.caption, transform=axes.transAxes, color="white", fontsize=8,
+            path_effects=[withStroke(linewidth=2, foreground="black")],
+        )  # fmt: skip
+
+
+def _draw_histogram(axes: "Axes", density: Float[Tensor, " bins"]) -> None:
+    """Bars in the colours of the l - o map, so that the histogram is also its scale."""
+    edges = torch.linspace(-1, 1, len(density) + 1)
+    centres = (edges[1:] + edges[:-1]) / 2
+    fills = colors.diverging(centres[None])[0].float() / 255
+    axes.bar(centres.tolist(), density.tolist(), width=2 / len(centres), color=fills.tolist())
+    axes.stairs(density.numpy(), edges.numpy(), color="0.3", linewidth=0.6)
+    axes.set(xlim=(-1, 1), xticks=[-1, -0.5, 0, 0.5, 1], yticks=[])
+    axes.set_xlabel(f"{DIFFERENCE} over all Gaussians", labelpad=2)
+    axes.spines["left"].set_visible(False)

@@ -1,0 +1,109 @@
+"""Picture files of a run: a folder per held-out view, a histogram and one sheet that shows them together."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from jaxtyping import UInt8
+from torch import Tensor
+
+from vlgs.query import Prompts, Query
+from vlgs.report.answer import ViewModel
+from vlgs.report.draw import Painter, ViewPictures
+from vlgs.report.overview import count_difference, write_histogram, write_overview
+from vlgs.types import Scene
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class PictureLimits:
+    """How much is drawn."""
+
+    views: int = 8
+    """Held-out views, spread evenly over all of them."""
+    prompts: int = 6
+    """Prompts per view."""
+    rows: int = 4
+    """Views on the overview."""
+
+
+def write_pictures(
+    folder: Path,
+    model: ViewModel,
+    scene: Scene,
+    query: Query,
+    prompts: Prompts | None,
+    limits: PictureLimits = PictureLimits(),
+) -> Path | None:
+    """Draw held-out views into ``<folder>/<view>/*.png``, and ``overview.png`` over them.
+
+    Args:
+        folder: Made if needed; the run's ``renders``.
+        model: The trained scene.
+        scene: Its held-out views and labels.
+        query: How relevancy is computed.
+        prompts: The scene's classes, encoded; without them only colour, features and l - o are drawn.
+        limits: How many views and prompts.
+
+    Returns:
+        The overview, or None if there is no held-out view.
+    """
+    views = spread(scene.test, limits.views)
+    if not views:
+        return None
+    folder.mkdir(parents=True, exist_ok=True)
+    painter = Painter(model, scene, query, prompts, views)
+    rows: list[ViewPictures] = []
+    on_overview = {view.name for view in spread(views, limits.rows)}
+    # Those of the overview first: the painter gives a prompt that was not shown yet to each view in turn.
+    for view in sorted(views, key=lambda view: view.name not in on_overview):
+        pictures = painter.draw(view, limits.prompts)
+        write_view(folder / _file_name(view.name), pictures)
+        if view.name in on_overview:
+            rows.append(pictures)
+    density = count_difference(painter.fused.language_weight, painter.fused.gaussians.opacities)
+    write_histogram(folder / "indicator_minus_opacity.png", density)
+    path = folder / "overview.png"
+    write_overview(path, scene, rows, density)
+    return path
+
+
+def write_view(folder: Path, pictures: ViewPictures) -> None:
+    """Every picture of one view at its own size."""
+    folder.mkdir(parents=True, exist_ok=True)
+    named = {
+        "photograph": pictures.photograph,
+        "render": pictures.render,
+        "features": pictures.features,
+        "indicator_minus_opacity": pictures.difference,
+        "labels": pictures.labels,
+        "prediction": pictures.prediction,
+    }
+    for prompt, answer in pictures.prompts.items():
+        named[f"relevancy_{_file_name(prompt)}"] = answer.relevancy
+        named[f"segmentation_{_file_name(prompt)}"] = answer.segmentation
+    for name, picture in named.items():
+        if picture is not None:
+            _save(folder / f"{name}.png", picture)
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most `count` items at even distances, the first among them, in order."""
+    count = min(count, len(items))
+    return [items[i * len(items) // count] for i in range(count)]
+
+
+def _file_name(text: str) -> str:
+    """A word or view name as a safe file name."""
+    return re.sub(r"[^\w.-]+", "_", text).strip(".") or "_"
+
+
+def _save(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:
+    from PIL import (
+        Image,
+    )  # pycolmap must not be imported before it; whoever needs pycolmap sees to that
+
+    Image.fromarray(picture.numpy()).save(path)

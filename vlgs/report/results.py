@@ -1,0 +1,96 @@
+"""metrics.json: one flat file per run, and the table that says what each entry means."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vlgs.files import write_atomically
+from vlgs.report.evaluate import Evaluation
+
+METRICS: Mapping[str, tuple[str, str]] = {
+    "psnr": ("dB", "mean over held-out views, colours clamped to [0, 1]"),
+    "ssim": ("-1..1", "mean over held-out views, 11x11 Gaussian window, mirrored borders"),
+    "miou": ("0..1", "mIoU under `protocol`"),
+    "loc_acc": ("0..1", "localisation accuracy under `protocol`"),
+    "per_category": ("0..1", "category -> IoU under `protocol`"),
+    "protocol": ("", "what miou and loc_acc mean: name@version split=..."),
+    "miou_<kind>": ("0..1", "mean IoU of the categories of a kind, e.g. translucent_reflective"),
+    "miou_dense": ("0..1", "argmax over all classes, pixels of all held-out views together"),
+    "pixel_accuracy": ("0..1", "share of pixels whose class is right"),
+    "miou_lerf_ovs": ("0..1", "relevancy over threshold, mean over units (view, category)"),
+    "loc_acc_lerf_ovs": ("0..1", "hits / units"),
+    "miou_lerf_ovs_ceiling": ("0..1", "miou_lerf_ovs of exact features: what can be reached"),
+    "loc_acc_lerf_ovs_ceiling": ("0..1", "loc_acc_lerf_ovs of exact features"),
+    "hits": ("", "units whose most relevant pixel lies on the object"),
+    "units": ("", "units that localisation was scored on"),
+    "test_views": ("", "held-out views"),
+    "test_views_seen": ("", "held-out views that were also trained on; 0 for a fair split"),
+    "n_gaussians": ("", "Gaussians at the end"),
+    "train_seconds": ("s", "wall time of training, without reading, evaluation and pictures"),
+    "fps_color": ("1/s", "colour render, median"),
+    "fps_language": ("1/s", "language render, median"),
+    "fps_query": ("1/s", "both renders, decoding and the relevancy of one prompt, median"),
+    "ply_bytes": ("B", "point_cloud.ply"),
+    "checkpoint_bytes": ("B", "newest checkpoint with optimiser state"),
+    "seed": ("", "seed of every random draw of the run"),
+    "config_hash": ("", "hash of all that can move a number; runs of one hash are one run"),
+    "commit": ("", "git commit, +dirty with local changes, null for an installed wheel"),
+    "machine": ("", "cpu, cores, threads, torch, platform"),
+    "per_view": ("", "held-out view -> psnr, ssim"),
+    "reasons": ("", "metric that is null -> why"),
+}
+"""Entry of metrics.json -> (unit or range, meaning). An entry that could not be computed is null."""
+
+
+def write_metrics(path: Path, evaluation: Evaluation, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Write metrics.json in one step, so that a reader sees the old file or the whole new one.
+
+    Args:
+        path: Where to; its folder must exist.
+        evaluation: Scores.
+        extra: Further entries named in `METRICS`, such as ``train_seconds``, ``seed`` and ``machine``.
+
+    Returns:
+        What was written. Numbers that are not finite are None, which JSON spells null.
+
+    Raises:
+        ValueError: If an extra entry is not in `METRICS`, or would overwrite a score.
+    """
+    scores = {
+        "psnr": evaluation.psnr,
+        "ssim": evaluation.ssim,
+        "miou": evaluation.miou,
+        "loc_acc": evaluation.loc_acc,
+        "protocol": evaluation.protocol,
+        **evaluation.beside,
+    }
+    details = {
+        "per_category": dict(evaluation.per_category),
+        "per_view": {name: dict(values) for name, values in evaluation.per_view.items()},
+        "reasons": dict(evaluation.reasons),
+    }
+    unknown = sorted(set(extra) - set(METRICS))
+    twice = sorted(set(extra) & (set(scores) | set(details)))
+    if unknown or twice:
+        raise ValueError(
+            f"metrics: extra entries must be listed in METRICS and new, got unknown {unknown} and repeated {twice}"
+        )
+    metrics = _finite({**scores, **extra, **details})
+    write_atomically(path, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
+    return metrics
+
+
+def metrics_table() -> str:
+    """The entries of metrics.json as a Markdown table, for README and ``--help``."""
+    rows = [f"| `{name}` | {unit} | {meaning} |" for name, (unit, meaning) in METRICS.items()]
+    return "\n".join(["| entry | unit | meaning |", "|---|---|---|", *rows])
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,58 @@
+"""What a run prints when it is done: the scores and where everything is."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+_ROWS = (
+    ("psnr", "PSNR", "{:.2f} dB"),
+    ("ssim", "SSIM", "{:.4f}"),
+    ("miou", "mIoU", "{:.1%}"),
+    ("miou_translucent_reflective", "  translucent or reflective", "{:.1%}"),
+    ("miou_other", "  other", "{:.1%}"),
+    ("loc_acc", "localisation accuracy", "{:.1%}"),
+    ("miou_lerf_ovs", "mIoU, LERF-OVS", "{:.1%}"),
+    ("miou_lerf_ovs_ceiling", "  of exact features", "{:.1%}"),
+    ("n_gaussians", "Gaussians", "{:,}"),
+    ("train_seconds", "training", "{:.1f} s"),
+    ("fps_color", "colour render", "{:.1f} /s"),
+    ("fps_language", "language render", "{:.1f} /s"),
+    ("fps_query", "query", "{:.1f} /s"),
+)
+_ALWAYS = ("psnr", "ssim", "miou", "loc_acc")
+
+
+def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> RenderableType:
+    """The result of a run for the terminal.
+
+    Args:
+        metrics: As `vlgs.report.results.write_metrics` returns them.
+        paths: What it is -> where it is, in the order to print.
+    """
+    table = Table("metric", box=box.SIMPLE_HEAD)
+    table.add_column("held-out views", justify="right")
+    for name, label, form in _ROWS:
+        value = metrics.get(name)
+        if value is not None:
+            table.add_row(label, form.format(value))
+        elif name in _ALWAYS:
+            table.add_row(label, "--")
+    per_category = metrics.get("per_category") or {}
+    for category, iou in per_category.items():
+        table.add_row(Text(f"  {category}"), "--" if iou is None else f"{iou:.1%}", style="dim")
+    notes = [Text(f"{name}: {why}", style="yellow") for name, why in metrics["reasons"].items()]
+    width = max((len(label) for label in paths), default=0)
+    places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
+    return Group(table, *notes, Text(f"protocol: {metrics['protocol']}"), *places)
+
+
+def print_summary(
+    metrics: Mapping[str, Any], paths: Mapping[str, Path], console: Console | None = None
+) -> None:
+    """Print `summary`; paths are never wrapped, so that they can be copied."""
+    (console or Console()).print(summary(metrics, paths), soft_wrap=True)

@@ -1,0 +1,88 @@
+"""Frames per second of a trained scene at the size of its data (systems.md B.6)."""
+
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from vlgs.query import Prompts, Query
+from vlgs.report.answer import ViewModel, answer_view
+from vlgs.types import Camera
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Views per second: 1 / median time of a view; None where nothing could be timed."""
+
+    fps_color: float | None
+    """Colour render alone."""
+    fps_language: float | None
+    """Language render alone."""
+    fps_query: float | None
+    """Both renders, decoding of every pixel, and the relevancy map of one prompt."""
+
+
+@torch.no_grad()
+def measure_fps(
+    model: ViewModel,
+    cameras: Sequence[Camera],
+    query: Query,
+    prompts: Prompts | None,
+    seconds: float = 5.0,
+    repeats: int = 100,
+) -> Timing:
+    """Time renders and queries; warm-up is left out, and cameras take turns.
+
+    Gaussians are fused once beforehand, as a viewer of a finished scene does. A query that judges prompts against each other is
+    timed with all of them, one that does not with the first.
+
+    Args:
+        model: The trained scene.
+        cameras: Usually those of the held-out views.
+        query: How relevancy is computed.
+        prompts: The scene's classes; without them queries are not timed.
+        seconds: Budget for all three figures together. It ends a measurement early, but never before three views.
+        repeats: Views per figure within the budget.
+    """
+    if not cameras:
+        return Timing(None, None, None)
+    fused, budget = model.fuse(), seconds / 3
+
+    def fps(work: Callable[[Camera], object]) -> float:
+        return 1 / _median_seconds(work, itertools.cycle(cameras), budget, repeats)
+
+    def ask(camera: Camera, prompts: Prompts) -> None:
+        answer = answer_view(model, camera, prompts, fused)
+        assert answer.cosines is not None  # there are prompts
+        assert answer.negatives is not None
+        query.relevancy(answer.cosines, answer.negatives)
+
+    fps_query = None
+    if prompts is not None:
+        one = prompts if query.needs_all_prompts else _first(prompts)
+        fps_query = fps(lambda camera: ask(camera, one))
+    return Timing(
+        fps_color=fps(lambda camera: model.render(camera, language=False, fused=fused)),
+        fps_language=fps(lambda camera: model.render(camera, color=False, fused=fused)),
+        fps_query=fps_query,
+    )
+
+
+def _median_seconds(
+    work: Callable[[Camera], object], cameras: Iterator[Camera], budget: float, repeats: int
+) -> float:
+    work(next(cameras))
+    times: list[float] = []
+    while len(times) < 3 or (len(times) < repeats and sum(times) < budget):
+        camera = next(cameras)
+        start = time.perf_counter()
+        work(camera)
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def _first(prompts: Prompts) -> Prompts:
+    return Prompts(prompts.names[:1], prompts.text[:1], prompts.negatives)
