@@ -147,9 +147,15 @@ def l1_dssim(
 def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c"]) -> float:
     """``max(0, SSIM(I1, I2))``, the weight of a pair in Eq. blend; a constant of the pair, so worth a cache.
 
-    SSIM goes down to -1, and a negative weight would reward a wrong render (S. D.12).
+    SSIM goes down to -1, and a negative weight would reward a wrong render (S. D.12). The bits do not depend on the number
+    of threads: the mean over a map does, so it is taken on one.
     """
-    return max(0.0, ssim(image1, image2).item())
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return max(0.0, ssim(image1, image2).item())
+    finally:
+        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)

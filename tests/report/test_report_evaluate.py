@@ -71,7 +71,7 @@ def test_object_labels_alone_give_lerf_ovs():
     got = score(scene(dense=False, objects=True))
     assert got.protocol == "lerf_ovs@1 split=synthetic"
     assert set(got.per_category) == set(OBJECTS)
-    assert (got.beside["hits"], got.beside["units"]) == (9, 9)
+    assert (got.beside["hits_lerf_ovs"], got.beside["units_lerf_ovs"]) == (9, 9)
     assert got.loc_acc == 1
     assert got.miou == got.beside["miou_lerf_ovs"]
     assert got.beside["miou_dense"] is None

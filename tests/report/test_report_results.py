@@ -23,7 +23,7 @@ EVALUATION = Evaluation(
     loc_acc=None,
     per_category={"wine glass": 0.5, "absent": None},
     per_view={"view_00": {"psnr": math.inf, "ssim": math.nan}},
-    beside={"miou_other": 0.7, "hits": 3},
+    beside={"miou_other": 0.7, "hits_lerf_ovs": 3},
     reasons={"loc_acc": "no held-out view has a labelled object"},
 )
 

@@ -1,9 +1,11 @@
 """The raw parameters that the optimiser moves, and what they stand for."""
 
 from collections.abc import Mapping
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from vlgs.types import Gaussians
 
@@ -39,8 +41,8 @@ def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:
         means=params["means"],
         quats=params["quats"],
         scales=params["log_scales"].exp(),
-        opacities=params["opacity_logits"].sigmoid(),
-        indicators=params["indicator_logits"].sigmoid(),
+        opacities=_logistic(params["opacity_logits"]),
+        indicators=_logistic(params["indicator_logits"]),
         sh0=params["sh0"],
         shN=params["shN"],
         features=params["features"],
@@ -50,3 +52,23 @@ def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:
 def logit(probability: float) -> float:
     """Inverse of the logistic function for a value strictly between 0 and 1."""
     return torch.tensor(probability, dtype=torch.float64).logit().item()
+
+
+class _Logistic(torch.autograd.Function):
+    """1 / (1 + exp(-x)), whose bits do not depend on the number of threads: those of `torch.sigmoid` do (torch 2.13)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = x.neg().exp_().add_(1).reciprocal_()
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_y: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        return d_y * y * (1 - y)
+
+
+def _logistic(x: Tensor) -> Tensor:
+    return cast(Tensor, _Logistic.apply(x))

@@ -42,6 +42,8 @@ class LanguageTally:
         self.confusion = torch.zeros(k, k, dtype=torch.long)
         self.scores: list[lerf_ovs.UnitScore] = []
         self.ceiling: list[lerf_ovs.UnitScore] = []
+        self.hits: list[bool] = []
+        self.hits_ceiling: list[bool] = []
         self.unscored: list[str] = []
 
     def add(self, view: View, answer: Answer) -> None:
@@ -54,7 +56,8 @@ class LanguageTally:
         assert answer.negatives is not None
         truth = read_truth(view)
         units = read_units(view, self.prompts.names, truth)
-        scores = self._score(self.query.relevancy(answer.cosines, answer.negatives), units)
+        relevancy = self.query.relevancy(answer.cosines, answer.negatives)
+        scores = self._score(relevancy, units)
         self.scores += scores
         self.unscored += [
             f"{score.category} in {view.name}" for score in scores if score.iou is None
@@ -62,7 +65,10 @@ class LanguageTally:
         if truth is not None:
             prediction = dense.predict_classes(answer.cosines)
             self.confusion += dense.confusion(prediction, truth, len(self.prompts.names))
-            self.ceiling += self._score(self._exact_relevancy(truth), units)
+            exact = self._exact_relevancy(truth)
+            self.ceiling += self._score(exact, units)
+            self.hits += _located(relevancy, truth)
+            self.hits_ceiling += _located(exact, truth)
 
     def conclude(
         self, headline: Headline, strict: bool, kinds: Mapping[str, str]
@@ -78,7 +84,7 @@ class LanguageTally:
         objects = lerf_ovs.scene_score(self.scores, strict)
         if headline == "dense":
             miou = mean_of_known(ious)
-            loc_acc = lerf_ovs.scene_score(self.scores, strict=True).loc_acc
+            loc_acc = _share(self.hits)
             per_category = dict(zip(self.prompts.names, ious, strict=True))
         else:
             miou, loc_acc, per_category = objects.miou, objects.loc_acc, objects.per_category
@@ -93,14 +99,16 @@ class LanguageTally:
     def _beside(self, objects: lerf_ovs.SceneScore, strict: bool) -> dict[str, float | int | None]:
         ceiling = lerf_ovs.scene_score(self.ceiling, strict)
         return {
+            "loc_acc_dense": _share(self.hits),
+            "loc_acc_dense_ceiling": _share(self.hits_ceiling),
             "miou_dense": mean_of_known(dense.class_iou(self.confusion)),
             "pixel_accuracy": dense.pixel_accuracy(self.confusion),
             "miou_lerf_ovs": objects.miou,
             "loc_acc_lerf_ovs": objects.loc_acc,
             "miou_lerf_ovs_ceiling": ceiling.miou,
             "loc_acc_lerf_ovs_ceiling": ceiling.loc_acc,
-            "hits": objects.hits,
-            "units": objects.located,
+            "hits_lerf_ovs": objects.hits,
+            "units_lerf_ovs": objects.located,
         }
 
     def _reasons(
@@ -130,6 +138,16 @@ class LanguageTally:
             cosines(carried, text), cosines(carried, self.prompts.negatives)
         )  # [k, k + 1]
         return relevancy[:, truth.long().masked_fill(truth == IGNORE_ID, len(text))]
+
+
+def _located(relevancy: Float[Tensor, "k h w"], truth: UInt8[Tensor, "h w"]) -> list[bool]:
+    """Localisation of every class that the view shows."""
+    shown = [i for i in truth.unique().tolist() if i != IGNORE_ID]
+    return [dense.localise(relevancy[i], truth == i) for i in shown]
+
+
+def _share(hits: list[bool]) -> float | None:
+    return sum(hits) / len(hits) if hits else None
 
 
 def _by_kind(
