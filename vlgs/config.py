@@ -1,0 +1,88 @@
+"""The configuration: where it lives, what it may construct, and which run it names. Imports no torch."""
+
+import hashlib
+import importlib.resources
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+_CHECKOUT = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(str(importlib.resources.files("vlgs")))
+CONF = _CHECKOUT / "conf" if (_CHECKOUT / "conf" / "config.yaml").is_file() else _PACKAGE / "conf"
+"""Folder of the configuration: beside the package in a checkout, inside it in an installed wheel."""
+
+TRUSTED_PACKAGES = ("vlgs", "torch", "lightning")
+"""Packages that a `_target_` may name; `plugins` in the configuration adds more."""
+
+NOT_PART_OF_A_RUN = frozenset(
+    {"data", "results", "logger", "progress", "pictures", "on_existing", "threads", "plugins", "hydra"}
+)
+"""Keys that cannot move a number. `data` is replaced by the fingerprint of the scene it leads to, so that a run does
+not depend on the folder that its data lies in."""
+
+
+def check_targets(config: DictConfig) -> None:
+    """Refuse a configuration that would construct something outside the trusted packages.
+
+    Raises:
+        ValueError: Names the key, the target and how to allow it.
+    """
+    trusted = (*TRUSTED_PACKAGES, *config.get("plugins", []))
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    for key, target in _targets(plain, ""):
+        package = str(target).partition(".")[0]
+        if package not in trusted or not all(part.isidentifier() for part in str(target).split(".")):
+            raise ValueError(
+                f"config: {key} must name something in {', '.join(trusted)}, got {target}; "
+                f"if you trust it, add its package: plugins=[{package}]"
+            )
+
+
+def instantiate(config: Any, **arguments: Any) -> Any:
+    """Construct what a `_target_` names, and check that it really comes from where its name says.
+
+    Raises:
+        ValueError: If the resolved object lives outside the package that was named (`vlgs.data.os.system`), or its own
+            error about a bad value, without Hydra's wrapping.
+        OSError: Likewise.
+    """
+    from hydra.errors import InstantiationException
+    from hydra.utils import get_object, instantiate
+
+    for key, target in _targets(OmegaConf.to_container(config, resolve=True), ""):
+        home = getattr(get_object(str(target)), "__module__", "") or ""
+        if home.partition(".")[0] != str(target).partition(".")[0]:
+            raise ValueError(f"config: {key} must come from its own package, got {target}, which is from {home}")
+    try:
+        return instantiate(config, **arguments)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, (ValueError, OSError)):
+            raise error.__cause__ from None
+        raise
+
+
+def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
+    """Hash of all that can move a number: the resolved configuration, the data's content and the results version."""
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    assert isinstance(plain, dict)
+    kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
+    if isinstance(kept.get("codec"), dict):
+        kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
+    identity = {"config": kept, "data": fingerprint, "results_version": results_version}
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(node, dict):
+        for name, child in node.items():
+            if name == "_target_":
+                yield f"{key}._target_".lstrip("."), child
+            else:
+                yield from _targets(child, f"{key}.{name}")
+    elif isinstance(node, list):
+        for index, child in enumerate(node):
+            yield from _targets(child, f"{key}.{index}")

@@ -1,0 +1,1 @@
+"""Training: the LightningModule, its settings, callbacks and checkpoints."""

@@ -1,0 +1,53 @@
+"""From a scene and the chosen parts to a module that is ready to train."""
+
+import logging
+from dataclasses import dataclass, replace
+
+from vlgs.blend import ViewBlend
+from vlgs.codec import Codec
+from vlgs.fusion import Fusion
+from vlgs.fusion.none import NoFusion
+from vlgs.gaussians import GaussiansConfig, initialise
+from vlgs.indicator import Indicator
+from vlgs.losses import Losses
+from vlgs.module.lightning import VLGSModule
+from vlgs.module.settings import TrainerConfig
+from vlgs.render.model import SplatModel
+from vlgs.types import RasterConfig, Scene
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The points chosen on the axes; one field per configuration group."""
+
+    gaussians: GaussiansConfig
+    fusion: Fusion
+    indicator: Indicator
+    blend: ViewBlend
+    codec: Codec
+    loss: Losses
+    raster: RasterConfig
+    trainer: TrainerConfig
+
+
+def build_module(scene: Scene, parts: Parts, seed: int) -> VLGSModule:
+    """Fit the codec, place the Gaussians and put everything together.
+
+    Raises:
+        ValueError: If the scene has no training view.
+    """
+    if not scene.train:
+        raise ValueError(f"train: training views of {scene.name} must be at least 1, got 0")
+    fusion, codec, config = parts.fusion, parts.codec, parts.gaussians
+    if scene.mask_vectors.shape[0] > 0:
+        codec.fit(scene.mask_vectors, scene.mask_areas)
+    else:
+        log.info("no language supervision: training colour only, without fusion or blended views")
+        # Indicators that nothing trains would keep every Gaussian alive.
+        fusion = NoFusion()
+        config = replace(config, prune_on="opacity")
+    parameters = initialise(scene, config, codec.dim, seed)
+    model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, sh_degree=0)
+    return VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed)

@@ -1,0 +1,109 @@
+"""Train a module to the end of its budget, or to the first Ctrl-C, from wherever its last checkpoint left it."""
+
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.loggers import Logger
+
+from vlgs.module.callbacks import (
+    Checkpoints,
+    CurveLog,
+    Densification,
+    GracefulStop,
+    ProgressLine,
+    TrainingClock,
+)
+from vlgs.module.checkpoint import load_checkpoint
+from vlgs.module.lightning import VLGSModule
+from vlgs.module.state import restore
+from vlgs.runs import RunFolder
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What surrounds training but cannot move a number."""
+
+    meta: dict[str, Any]
+    """JSON values that go into every checkpoint, e.g. the configuration."""
+    progress: bool = True
+    loggers: Sequence[Logger] = ()
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The iterations that remain, as Lightning wants its batches."""
+
+    module: VLGSModule
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(self.module.next_step, self.module.settings.iterations))
+
+    def __len__(self) -> int:
+        return self.module.settings.iterations - self.module.next_step
+
+
+def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | None:
+    """Train what remains.
+
+    Returns:
+        None when the budget is done, else the name of the signal that stopped it; either way the last whole step is saved.
+
+    Raises:
+        FloatingPointError: If a loss or gradient is not finite; the checkpoint before it stays.
+        OSError: If a checkpoint cannot be written; the one before stays.
+    """
+    checkpoint = load_checkpoint(folder.checkpoint)
+    if checkpoint is not None:
+        restore(module, checkpoint)
+        log.info("resuming %s at step %d", folder.path, module.next_step)
+    steps = _Steps(module)
+    if len(steps) == 0:
+        return None
+    folder.path.mkdir(parents=True, exist_ok=True)
+    stop = GracefulStop()
+    callbacks: list[L.Callback] = [
+        TrainingClock(),
+        Densification(),
+        CurveLog(folder.curves, module.settings.log_every),
+        Checkpoints(folder.checkpoint, module.settings.checkpoint_every, options.meta),
+        stop,
+    ]
+    if options.progress:
+        callbacks.append(ProgressLine())
+    with _expected_warnings():
+        _trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
+    return stop.stopped_by
+
+
+def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions) -> L.Trainer:
+    """A Trainer that adds nothing of its own to a step: checkpoints, curves and the bar are callbacks of ours."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    return L.Trainer(
+        accelerator="cpu",
+        max_epochs=1,
+        logger=list(options.loggers),
+        callbacks=callbacks,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder.path,
+    )
+
+
+@contextmanager
+def _expected_warnings() -> Iterator[None]:
+    """Two warnings of Lightning that are no news here."""
+    with warnings.catch_warnings():
+        # The codec is fitted before training starts; its BatchNorm must keep the statistics it has.
+        warnings.filterwarnings("ignore", message="Found .* module.* in eval mode")
+        # Lightning 2.6 under torch 2.13, in its own tree utilities.
+        warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated")
+        yield

@@ -1,0 +1,152 @@
+"""A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from vlgs.codec import Codec
+from vlgs.fusion import Fusion
+from vlgs.gaussians.parameters import activate
+from vlgs.gaussians.sh import sh_to_rgb, view_color_residual
+from vlgs.geometry import camera_center
+from vlgs.indicator import Indicator
+from vlgs.render.rasterize import rasterize
+from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
+
+
+@dataclass(frozen=True)
+class FusedGaussians:
+    """Gaussians after fusion: what all renders of one iteration share."""
+
+    gaussians: Gaussians
+    color: Float[Tensor, "n 3"]
+    """u_1..3 of Eq. attention: RGB before the view-dependent part is added."""
+    feature: Float[Tensor, "n d"]
+    """u_4.. of Eq. attention."""
+    language_weight: Float[Tensor, " n"]
+    """What blends language: l, o or a constant, as the indicator says (Eq. lancity)."""
+
+
+@dataclass(frozen=True)
+class ViewRender:
+    """One view of a model. A modality that was not asked for is None."""
+
+    color: Float[Tensor, "h w 3"] | None
+    feature: Float[Tensor, "h w d"] | None
+    alpha_color: Float[Tensor, "h w"] | None
+    alpha_language: Float[Tensor, "h w"] | None
+    visible: Bool[Tensor, " n"]
+    mean2d: Float[Tensor, "n 2"]
+
+
+class SplatModel(nn.Module):
+    """What a checkpoint holds and an evaluation needs.
+
+    Args:
+        parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`.
+        fusion: Mixes colour and language of each Gaussian (Eq. attention).
+        indicator: Chooses what blends language (Eq. lancity).
+        codec: Embedding to language code and back.
+        raster: Constants of the rasterizer.
+        sh_degree: Highest spherical harmonics degree in use, 0 to 3.
+    """
+
+    def __init__(
+        self,
+        parameters: dict[str, Tensor],
+        fusion: Fusion,
+        indicator: Indicator,
+        codec: Codec,
+        raster: RasterConfig,
+        sh_degree: int,
+    ) -> None:
+        super().__init__()
+        self.splats = nn.ParameterDict({k: nn.Parameter(v) for k, v in parameters.items()})
+        self.fusion = fusion
+        self.indicator = indicator
+        self.codec = codec
+        self.raster = raster
+        self.sh_degree = sh_degree
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return self.splats["means"].shape[0]
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians in natural units."""
+        return activate(self.splats)
+
+    def fuse(self) -> FusedGaussians:
+        """Activate and fuse all Gaussians; once per iteration, however many views are rendered."""
+        gaussians = self.gaussians()
+        color, feature = self.fusion(sh_to_rgb(gaussians.sh0), gaussians.features)
+        return FusedGaussians(gaussians, color, feature, self.indicator(gaussians))
+
+    def render(
+        self,
+        camera: Camera,
+        color: bool = True,
+        language: bool = True,
+        fused: FusedGaussians | None = None,
+    ) -> ViewRender:
+        """Render colour, language or both in one pass over the tiles.
+
+        Args:
+            camera: Where to look from.
+            color: Whether colour is wanted.
+            language: Whether language is wanted.
+            fused: Result of `fuse`, when several views share it.
+
+        Raises:
+            ValueError: If neither modality is wanted, or a Gaussian is not finite.
+        """
+        if not (color or language):
+            raise ValueError("render: color or language must be true, got neither")
+        fused = self.fuse() if fused is None else fused
+        groups = []
+        if color:
+            groups.append(ChannelGroup(self._view_color(fused, camera), fused.gaussians.opacities))
+        if language:
+            groups.append(ChannelGroup(fused.feature, fused.language_weight))
+        out = self._rasterize(fused.gaussians, groups, camera)
+        return ViewRender(
+            color=out.images[0] if color else None,
+            feature=out.images[-1] if language else None,
+            alpha_color=out.alphas[0] if color else None,
+            alpha_language=out.alphas[-1] if language else None,
+            visible=out.visible,
+            mean2d=out.mean2d,
+        )
+
+    def render_values(
+        self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
+    ) -> Float[Tensor, "h w c"]:
+        """Blend any per-Gaussian values with any weight, e.g. the l - o map of fig. lancity-vis."""
+        gaussians = self.gaussians()
+        return self._rasterize(gaussians, [ChannelGroup(values, weight)], camera).images[0]
+
+    def _view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
+        if self.sh_degree == 0:
+            return fused.color.clamp_min(0.0)
+        # As in 3DGS the direction carries no gradient of its own into the position's screen statistics, but it does
+        # reach `means`: the colour of a Gaussian depends on where it is seen from.
+        offsets = fused.gaussians.means - camera_center(camera.viewmat)
+        directions = torch.nn.functional.normalize(offsets, dim=-1, eps=1e-8)
+        residual = view_color_residual(fused.gaussians.shN, directions, self.sh_degree)
+        return (fused.color + residual).clamp_min(0.0)
+
+    def _rasterize(self, gaussians: Gaussians, groups: list[ChannelGroup], camera: Camera):
+        return rasterize(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            groups,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            config=self.raster,
+        )
