@@ -1,0 +1,53 @@
+"""What a procedural scene is a function of."""
+
+import hashlib
+from dataclasses import astuple, dataclass, field, replace
+
+from vlgs.data.synthetic.layouts import DIFFICULTIES, SCENES
+from vlgs.data.synthetic.masks import Faults
+
+VERSION = 1
+"""Part of every fingerprint; raise it with any change that moves a pixel, a label, a point or a vector."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All parameters but the mask level; `load_scene` says what they mean."""
+
+    scene: str = "glassware"
+    difficulty: str = "easy"
+    width: int = 200
+    height: int = 150
+    train_views: int = 40
+    test_views: int = 8
+    seed: int = 0
+    points: int = 4000
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self):
+        for name, value, options in (
+            ("scene", self.scene, SCENES),
+            ("difficulty", self.difficulty, DIFFICULTIES),
+        ):
+            if value not in options:
+                raise ValueError(
+                    f"synthetic: {name} must be one of {', '.join(options)}, got {value!r}"
+                )
+        for name, low, high in (
+            ("width", 16, 8192),
+            ("height", 16, 8192),
+            ("train_views", 2, 9999),
+            ("test_views", 0, self.train_views - 1),
+            ("seed", 0, 2**63 - 1),
+            ("points", 0, 10**7),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(
+                    f"synthetic: {name} must be in [{low}, {high}], got {getattr(self, name)}"
+                )
+
+    def fingerprint(self, level: int) -> str:
+        """Hash of the parameters, with faults as they come out, and of the generator's version."""
+        resolved = replace(self, faults=self.faults.resolve(self.difficulty))
+        text = f"vlgs.data.synthetic {VERSION} {astuple(resolved)} {level}"
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

@@ -1,0 +1,93 @@
+"""Photographs of a scene, taken once, and what its segmenters could find in them."""
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Int
+
+from vlgs.data.synthetic.cameras import camera_at, moments
+from vlgs.data.synthetic.layouts import build
+from vlgs.data.synthetic.masks import NO_FAULTS, Region
+from vlgs.data.synthetic.photographs import Photograph, photograph
+from vlgs.data.synthetic.recipe import Recipe
+from vlgs.data.synthetic.world import World
+from vlgs.types import Camera
+
+_LAYOUT, _WALK = 100, 101  # purposes of draws; `masks` and `scene` have others
+_PATCHES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph with its place in the walk."""
+
+    name: str
+    number: int
+    """Among the training views, or among the held-out ones."""
+    camera: Camera
+    photo: Photograph
+
+
+@dataclass(frozen=True)
+class Studio:
+    """What does not depend on faults, points and level."""
+
+    world: World
+    classes: tuple[str, ...]
+    class_of_part: np.ndarray
+    train: tuple[Shot, ...]
+    test: tuple[Shot, ...]
+
+
+def open_studio(recipe: Recipe) -> Studio:
+    """Build and photograph; kept in memory, as sweeps over levels and faults ask for the same photographs again."""
+    return _shoot(replace(recipe, points=0, faults=NO_FAULTS))
+
+
+@functools.lru_cache(maxsize=2)
+def _shoot(recipe: Recipe) -> Studio:
+    things = build(recipe.scene, recipe.difficulty, np.random.default_rng([_LAYOUT, recipe.seed]))
+    world = World(things)
+    classes = tuple(dict.fromkeys(thing.name for thing in things))
+    class_of_thing = np.array([classes.index(thing.name) for thing in things], np.uint8)
+    train, test = moments(recipe.train_views, recipe.test_views)
+    order = np.argsort(np.argsort(np.concatenate([train, test])))
+    shots = []
+    for position, moment in zip(
+        order.tolist(), np.concatenate([train, test]).tolist(), strict=True
+    ):
+        held_out = len(shots) >= recipe.train_views
+        number = len(shots) - recipe.train_views * held_out
+        rng = np.random.default_rng([_WALK, recipe.seed, int(held_out), number])
+        camera = camera_at(moment, rng, recipe.width, recipe.height)
+        shots.append(Shot(f"frame_{position + 1:05d}", number, camera, photograph(world, camera)))
+    return Studio(
+        world,
+        classes,
+        class_of_thing[world.thing_of_part],
+        tuple(shots[: recipe.train_views]),
+        tuple(shots[recipe.train_views :]),
+    )
+
+
+def regions(
+    world: World, photo: Photograph
+) -> tuple[dict[int, Int[np.ndarray, "h w"]], dict[int, dict[int, Region]]]:
+    """Region number per pixel, and what the regions are, at levels 1 (subpart), 2 (part) and 3 (whole)."""
+    part = photo.part.astype(np.int64)
+    numbers = {3: world.thing_of_part[part], 2: part, 1: part * _PATCHES + photo.patch}
+    place = np.concatenate([np.arange(len(thing.parts)) for thing in world.things])
+
+    def region(level: int, number: int) -> Region:
+        if level == 3:
+            return Region(world.things[number].name, "whole")
+        part, patch = (number, None) if level == 2 else divmod(number, _PATCHES)
+        word = world.things[world.thing_of_part[part]].name
+        return Region(word, f"{word}, part {place[part]}, patch {patch}")
+
+    names = {
+        level: {n: region(level, n) for n in np.unique(found).tolist()}
+        for level, found in numbers.items()
+    }
+    return numbers, names

@@ -1,0 +1,179 @@
+"""Things laid out for rays: who is hit first, with which colour and normal, and how much lamp light arrives."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+from vlgs.data.synthetic.layouts import FLOOR, LAMP, ROOM, TABLE_RADIUS
+from vlgs.data.synthetic.shapes import Vectors
+from vlgs.data.synthetic.things import Part, Thing
+
+NOTHING = 255
+"""Part number of a ray that hits nothing; does not happen from inside the room."""
+
+_SHADOW_RAYS = 24
+_SHADOW_CELLS = 192
+_LAMP_RADIUS = 0.26
+_GLASS_PASSES = 0.7  # share of the light that one piece of glass lets through
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First surface along each ray."""
+
+    t: Float[np.ndarray, " n"]
+    part: UInt8[np.ndarray, " n"]
+    face: UInt8[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Shade:
+    """Share of the lamp that reaches a square of a horizontal plane, on a grid."""
+
+    half: float
+    grid: Float[np.ndarray, "g g"]
+
+    def at(self, point: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+        """Bilinear lookup by x and y."""
+        cells = self.grid.shape[0]
+        scaled = (point[:2] / (2 * self.half) + 0.5) * (cells - 1)
+        x, y = np.clip(scaled, 0, cells - 1.001)
+        i, j = x.astype(np.intp), y.astype(np.intp)
+        x, y = x - i, y - j
+        near = self.grid[i, j] * (1 - y) + self.grid[i, j + 1] * y
+        far = self.grid[i + 1, j] * (1 - y) + self.grid[i + 1, j + 1] * y
+        return near * (1 - x) + far * x
+
+
+class World:
+    """Things with everything precomputed that a ray needs to know about them."""
+
+    def __init__(self, things: tuple[Thing, ...]):
+        self.things = things
+        self.parts: tuple[Part, ...] = tuple(part for thing in things for part in thing.parts)
+        self.thing_of_part = np.repeat(np.arange(len(things)), [len(t.parts) for t in things])
+        self._rotations = [np.array(part.rotation) for part in self.parts]
+        self._centers = [np.array(part.center)[:, None] for part in self.parts]
+        bounds = [part.shape.bound() for part in self.parts]
+        heights = np.array([height for height, _ in bounds])
+        axes = np.stack([rotation[:, 2] for rotation in self._rotations])
+        self._bound_centers = np.concatenate(self._centers, axis=1).T + axes * heights[:, None]
+        # Which rays come near is decided in float32 with a millimetre to spare.
+        self._bound_radii2 = np.array([[(radius + 1e-3) ** 2] for _, radius in bounds], np.float32)
+        self.shades = self._shades()
+
+    def _shades(self) -> dict[int, Shade]:
+        """Shadows of what stands on the table on its top, and of the table on the floor, by part number."""
+        names = np.array([self.things[thing].name for thing in self.thing_of_part])
+        table, floor = (
+            np.flatnonzero(names == "wooden table"),
+            np.flatnonzero(names == "tiled floor"),
+        )
+        return {
+            int(table[0]): self._shade(TABLE_RADIUS, 0.0, list(range(table[0]))),
+            int(floor[0]): self._shade(ROOM, FLOOR, table.tolist()),
+        }
+
+    def _shade(self, half: float, height: float, casters: list[int]) -> Shade:
+        """Look from every grid point at a disc of lamp points; glass dims it, all else stops it."""
+        steps = np.linspace(-half, half, _SHADOW_CELLS)
+        x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+        origin = np.stack([x, y, np.full(x.shape, height + 1e-4)])
+        light = np.zeros(x.size)
+        for goal in _lamp_points():
+            direction = goal[:, None] - origin
+            direction /= np.sqrt((direction**2).sum(0))
+            through = np.ones(x.size)
+            near = self._near(origin, direction)
+            for number in casters:
+                rays = np.flatnonzero(near[number])
+                start, towards = origin.take(rays, axis=1), direction.take(rays, axis=1)
+                t, _ = self._intersect(number, start, towards, np.zeros(rays.size))
+                glass = self.parts[number].material.kind == "glass"
+                through[rays[np.isfinite(t)]] *= _GLASS_PASSES if glass else 0.0
+            light += through
+        return Shade(half, (light / _SHADOW_RAYS).reshape(_SHADOW_CELLS, _SHADOW_CELLS))
+
+    def _near(
+        self, origin: Vectors, direction: Float[np.ndarray, "3 n"]
+    ) -> Bool[np.ndarray, "parts n"]:
+        """Which rays pass through the bounding sphere of which part."""
+        if origin.shape[1] == 1:
+            offset = self._bound_centers - origin.T
+            distance2 = (offset * offset).sum(1, keepdims=True).astype(np.float32)
+            along = apply(offset.astype(np.float32), direction.astype(np.float32))
+        else:
+            start, centers = origin.astype(np.float32), self._bound_centers.astype(np.float32)
+            distance2 = apply(-2 * centers, start)
+            distance2 += (centers * centers).sum(1, keepdims=True) + (start * start).sum(0)
+            along = apply(centers, direction.astype(np.float32))
+            along -= (origin * direction).sum(0).astype(np.float32)
+        return along * along >= distance2 - self._bound_radii2
+
+    def _intersect(
+        self,
+        number: int,
+        origin: Vectors,
+        direction: Float[np.ndarray, "3 n"],
+        t_min: Float[np.ndarray, " n"],
+    ) -> tuple[Float[np.ndarray, " n"], UInt8[np.ndarray, " n"]]:
+        rotation, center = self._rotations[number].T, self._centers[number]
+        start, towards = apply(rotation, origin - center), apply(rotation, direction)
+        return self.parts[number].shape.intersect(start, towards, t_min)
+
+    def first_hit(
+        self, origin: Vectors, direction: Float[np.ndarray, "3 n"], t_min: Float[np.ndarray, " n"]
+    ) -> Hits:
+        """Nearest surface beyond `t_min` along each ray."""
+        count = direction.shape[1]
+        best = np.full(count, np.inf)
+        part, face = np.full(count, NOTHING, np.uint8), np.zeros(count, np.uint8)
+        near = self._near(origin, direction)
+        for number in range(len(self.parts)):
+            rays = np.flatnonzero(near[number])
+            if not rays.size:
+                continue
+            start = origin if origin.shape[1] == 1 else origin.take(rays, axis=1)
+            t, side = self._intersect(number, start, direction.take(rays, axis=1), t_min[rays])
+            closer = t < best[rays]
+            rays = rays[closer]
+            best[rays], part[rays], face[rays] = t[closer], number, side[closer]
+        return Hits(best, part, face)
+
+    def surface(
+        self, hits: Hits, point: Float[np.ndarray, "3 n"]
+    ) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "3 n"], UInt16[np.ndarray, " n"]]:
+        """Colour before light, outward normal and patch at the hit points."""
+        color, normal = np.zeros_like(point), np.zeros_like(point)
+        normal[2] = 1.0
+        patch = np.zeros(hits.part.shape, np.uint16)
+        for number, rays in by_part(hits.part):
+            local = apply(self._rotations[number].T, point[:, rays] - self._centers[number])
+            color[:, rays], patch[rays] = self.parts[number].material.pattern(local)
+            outward = self.parts[number].shape.normal(local, hits.face[rays])
+            normal[:, rays] = apply(self._rotations[number], outward)
+        return color, normal, patch
+
+
+def apply(
+    matrix: Float[np.ndarray, "p 3"], vectors: Float[np.ndarray, "3 n"]
+) -> Float[np.ndarray, "p n"]:
+    """Matrix times vectors without BLAS, whose threads cost more than they bring here and may move the last bit."""
+    return np.einsum("pi,in->pn", matrix, vectors)
+
+
+def by_part(part: UInt8[np.ndarray, " n"]) -> list[tuple[int, np.ndarray]]:
+    """Ray numbers of every part that was hit."""
+    order = np.argsort(part, kind="stable")
+    numbers, starts = np.unique(part[order], return_index=True)
+    groups = np.split(order, starts[1:])
+    return [(int(n), rays) for n, rays in zip(numbers, groups, strict=True) if n != NOTHING]
+
+
+def _lamp_points() -> Float[np.ndarray, "s 3"]:
+    """A sunflower of points on the lamp's disc: even, and without a random draw."""
+    ray = np.arange(_SHADOW_RAYS)
+    radius, angle = _LAMP_RADIUS * np.sqrt((ray + 0.5) / _SHADOW_RAYS), 2.39996 * ray
+    offset = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(ray.size)], axis=1)
+    return np.array(LAMP) + offset
