@@ -1,0 +1,179 @@
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import TINY, composed
+
+from vlgs.report.results import METRICS
+from vlgs.run import run
+from vlgs.runs import RunFolder
+
+SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30")
+
+
+def command(*overrides: str) -> list[str]:
+    return [sys.executable, "-m", "vlgs.run", *overrides]
+
+
+def only_run(results: Path) -> RunFolder:
+    (path,) = (results / "runs").iterdir()
+    return RunFolder(path)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results folder with one finished run of the full model."""
+    results = tmp_path_factory.mktemp("results")
+    assert run(composed(*SHORT, f"results={results}")) == 0
+    return results
+
+
+def test_a_run_leaves_everything_the_manual_promises(finished: Path):
+    folder = only_run(finished)
+    metrics = json.loads(folder.metrics.read_text())
+    kinds = {f"miou_{kind}" for kind in ("translucent_reflective", "other")}
+    assert set(metrics) - kinds <= set(METRICS)
+    for name in ("psnr", "ssim", "miou", "loc_acc", "fps_color", "fps_language", "fps_query", "train_seconds"):
+        assert metrics[name] is not None
+        assert metrics[name] >= 0
+    assert metrics["protocol"] == "dense@1 split=synthetic"
+    assert metrics["config_hash"] == folder.path.name
+    assert metrics["ply_bytes"] == folder.ply.stat().st_size
+    assert set(metrics["per_category"]) >= {"wine glass", "wall"}
+    assert metrics["test_views_seen"] == 0
+    assert (folder.renders / "overview.png").is_file()
+    views = [path for path in folder.renders.iterdir() if path.is_dir()]
+    assert len(views) == 2
+    pictures = {"photograph", "render", "features", "labels", "prediction", "indicator_minus_opacity"}
+    for view in views:
+        names = {path.stem for path in view.iterdir()}
+        assert names >= pictures
+        assert any(name.startswith("relevancy_") for name in names)
+    assert folder.config.is_file()
+    assert folder.curves.read_text().splitlines()[0].startswith("step,loss,psnr,n_gaussians")
+
+
+def test_a_finished_run_is_reported_not_repeated(finished: Path, capsys: pytest.CaptureFixture[str]):
+    folder = only_run(finished)
+    before = {path: path.stat().st_mtime_ns for path in folder.path.rglob("*") if path.name != ".lock"}
+    assert run(composed(*SHORT, f"results={finished}", "threads=1", "pictures=false")) == 0
+    assert "PSNR" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_an_existing_run_can_be_refused(finished: Path):
+    with pytest.raises(FileExistsError, match=r"must not exist with on_existing=refuse; on_existing=resume goes on"):
+        run(composed(*SHORT, f"results={finished}", "on_existing=refuse"))
+
+
+def test_an_unfinished_report_is_taken_up_without_training_again(finished: Path, tmp_path: Path):
+    shutil.copytree(finished, tmp_path / "copy")
+    folder = only_run(tmp_path / "copy")
+    want = json.loads(folder.metrics.read_text())
+    folder.metrics.unlink()
+    assert run(composed(*SHORT, f"results={tmp_path / 'copy'}", "pictures=false")) == 0
+    got = json.loads(folder.metrics.read_text())
+    assert {k: got[k] for k in ("psnr", "miou", "per_view", "train_seconds")} == {
+        k: want[k] for k in ("psnr", "miou", "per_view", "train_seconds")
+    }
+
+
+def test_a_run_in_use_is_refused(finished: Path):
+    folder = only_run(finished)
+    with folder.writing(), pytest.raises(BlockingIOError, match="must not be in use, got process"):
+        run(composed(*SHORT, f"results={finished}"))
+
+
+def test_a_word_that_the_vocabulary_lacks_ends_the_run_before_training(tmp_path: Path):
+    from dataclasses import replace
+
+    from omegaconf import open_dict
+
+    import vlgs.data.synthetic as synthetic
+
+    scene = synthetic.load_scene(width=48, height=36, train_views=6, test_views=2, points=400)
+    odd = replace(scene, classes=("vine glass", *scene.classes[1:]))
+    config = composed(*SHORT, f"results={tmp_path}")
+    with open_dict(config), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "load_scene", lambda **_: odd)
+        synthetic.load_scene.__module__ = "vlgs.data.synthetic"
+        with pytest.raises(ValueError, match=r"got 'vine glass' \(did you mean 'wine glass'"):
+            run(config)
+    assert not only_run(tmp_path).checkpoint.exists()
+
+
+def test_ctrl_c_saves_says_how_to_go_on_and_goes_on(tmp_path: Path):
+    overrides = (*TINY, "trainer=smoke", "trainer.iterations=4000", f"results={tmp_path}", "trainer.log_every=1", "pictures=false")
+    process = subprocess.Popen(command(*overrides), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 240
+    logs: list[Path] = []
+    while not (logs and len(logs[0].read_text().splitlines()) > 3) and time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+        logs = list(tmp_path.glob("runs/*/log.csv"))
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    match = re.search(r"SIGINT: stopped and saved at step (\d+) of 4000; the same command goes on from there", errors)
+    assert match, errors
+    assert "python -m vlgs.run" in errors
+    from vlgs.module.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(only_run(tmp_path).checkpoint)
+    assert checkpoint is not None
+    assert checkpoint.step == int(match[1])
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("fusion=sel", ["Could not find 'fusion/sel'", "self", "none", "mlp", "cross"]),
+        ("fusion.dmi=3", ["dmi", "not in struct"]),
+        ("seed=0.5.5", ["seed"]),
+        ("fusion._target_=os.system", ["error: config: fusion._target_ must name something in vlgs, torch, lightning"]),
+        ("data=colmap", ["data.root"]),
+        ("data=colmap data.root=/nowhere/at/all", ["error:", "/nowhere/at/all", "sparse"]),
+        ("on_existing=overwrite", ["error: config: on_existing must be resume or refuse, got overwrite"]),
+        ("trainer.iterations=0", ["error: trainer: iterations must be at least 1, got 0"]),
+    ],
+)
+def test_bad_input_is_one_clear_error(tmp_path: Path, override: str, words: list[str]):
+    extra = [] if "data=" in override else list(TINY)
+    done = subprocess.run(
+        command(*extra, *override.split(), f"results={tmp_path}"), capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr, done.stderr
+
+
+def test_help_is_a_manual_and_needs_no_torch():
+    code = (
+        "import sys, vlgs.run; sys.argv = ['vlgs.run', '--help']\n"
+        "try:\n    vlgs.run.main()\nexcept SystemExit:\n    pass\n"
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.rstrip().endswith("False"), "--help must stay light"
+    for section in ("NAME", "SYNOPSIS", "EXAMPLES", "GROUPS", "FILES", "EXIT STATUS", "fusion: cross, mlp, none, self"):
+        assert section in done.stdout
+
+
+def test_a_multirun_makes_one_run_per_combination(tmp_path: Path):
+    done = subprocess.run(
+        command("-m", *SHORT, "trainer.iterations=3", "blend=none,fixed", f"results={tmp_path}", "pictures=false"),
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    folders = [RunFolder(path) for path in (tmp_path / "runs").iterdir()]
+    assert len(folders) == 2
+    assert all(folder.finished() for folder in folders)
