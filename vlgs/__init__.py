@@ -31,7 +31,7 @@ _HOME = {
     "Scene": "vlgs.types",
 }
 
-__all__ = ["Camera", "ChannelGroup", "RasterConfig", "Rendered", "Scene", "rasterize"]  # noqa: F822
+__all__ = ["Camera", "ChannelGroup", "RasterConfig", "Rendered", "Scene", "rasterize"]
 
 
 def __getattr__(name: str) -> Any:

@@ -18,7 +18,17 @@ TRUSTED_PACKAGES = ("vlgs", "torch", "lightning")
 """Packages that a `_target_` may name; `plugins` in the configuration adds more."""
 
 NOT_PART_OF_A_RUN = frozenset(
-    {"data", "results", "logger", "progress", "pictures", "on_existing", "threads", "plugins", "hydra"}
+    {
+        "data",
+        "results",
+        "logger",
+        "progress",
+        "pictures",
+        "on_existing",
+        "threads",
+        "plugins",
+        "hydra",
+    }
 )
 """Keys that cannot move a number. `data` is replaced by the fingerprint of the scene it leads to, so that a run does
 not depend on the folder that its data lies in."""
@@ -34,7 +44,9 @@ def check_targets(config: DictConfig) -> None:
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     for key, target in _targets(plain, ""):
         package = str(target).partition(".")[0]
-        if package not in trusted or not all(part.isidentifier() for part in str(target).split(".")):
+        if package not in trusted or not all(
+            part.isidentifier() for part in str(target).split(".")
+        ):
             raise ValueError(
                 f"config: {key} must name something in {', '.join(trusted)}, got {target}; "
                 f"if you trust it, add its package: plugins=[{package}]"
@@ -55,7 +67,9 @@ def instantiate(config: Any, **arguments: Any) -> Any:
     for key, target in _targets(OmegaConf.to_container(config, resolve=True), ""):
         home = getattr(get_object(str(target)), "__module__", "") or ""
         if home.partition(".")[0] != str(target).partition(".")[0]:
-            raise ValueError(f"config: {key} must come from its own package, got {target}, which is from {home}")
+            raise ValueError(
+                f"config: {key} must come from its own package, got {target}, which is from {home}"
+            )
     try:
         return instantiate(config, **arguments)
     except InstantiationException as error:

@@ -97,7 +97,9 @@ def _text_encoder(config: DictConfig, scene: Any) -> Any:
         return None
     text = instantiate(config.text)(vocabulary=scene.vocabulary)
     if isinstance(text, VocabularyText) and scene.vocabulary is None:
-        log.warning("no vocabulary: language is trained but not scored (data.vocabulary=FILE or text=clip)")
+        log.warning(
+            "no vocabulary: language is trained but not scored (data.vocabulary=FILE or text=clip)"
+        )
         return None
     encode_prompts(instantiate(config.query), text, scene.classes)
     return text
@@ -109,11 +111,15 @@ def _train(folder: RunFolder, config: DictConfig, scene: Any) -> tuple[Any, str 
     from vlgs.module.build import Parts, build_module
     from vlgs.module.fit import FitOptions, fit
 
-    torch.manual_seed(config.seed)  # initial weights of the fusion; every other draw has a generator of its own
+    # Initial weights of the fusion come from the global generator; every other draw has one of its own.
+    torch.manual_seed(config.seed)
     parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
     module = build_module(scene, parts, config.seed)
     options = FitOptions(
-        meta={"config": OmegaConf.to_container(config, resolve=True), "fingerprint": scene.fingerprint},
+        meta={
+            "config": OmegaConf.to_container(config, resolve=True),
+            "fingerprint": scene.fingerprint,
+        },
         progress=config.progress,
         loggers=[instantiate(logger) for logger in config.logger.loggers],
     )

@@ -6,7 +6,19 @@ from omegaconf import OmegaConf
 
 from vlgs.config import CONF, check_targets, instantiate
 
-CONSTRUCTED = ("gaussians", "fusion", "indicator", "blend", "codec", "loss", "raster", "trainer", "query", "text", "protocol")
+CONSTRUCTED = (
+    "gaussians",
+    "fusion",
+    "indicator",
+    "blend",
+    "codec",
+    "loss",
+    "raster",
+    "trainer",
+    "query",
+    "text",
+    "protocol",
+)
 OPTIONS = sorted(
     (path.parent.name, path.stem)
     for group in (*CONSTRUCTED, "data", "logger")

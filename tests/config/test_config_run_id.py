@@ -20,11 +20,17 @@ def config(**changes: object) -> DictConfig:
 
 def test_the_id_ignores_where_things_lie_and_how_many_threads():
     want = run_id(config(), "f", 1)
-    moved = config(results="elsewhere", threads=1, data={"_target_": "vlgs.data.colmap.load_scene", "root": "there"})
+    moved = config(
+        results="elsewhere",
+        threads=1,
+        data={"_target_": "vlgs.data.colmap.load_scene", "root": "there"},
+    )
     assert run_id(moved, "f", 1) == want
 
 
-@pytest.mark.parametrize("change", [{"seed": 1}, {"blend": {"_target_": "vlgs.blend.BetaBlend", "alpha": 0.1}}])
+@pytest.mark.parametrize(
+    "change", [{"seed": 1}, {"blend": {"_target_": "vlgs.blend.BetaBlend", "alpha": 0.1}}]
+)
 def test_the_id_follows_the_configuration(change: dict):
     assert run_id(config(**change), "f", 1) != run_id(config(), "f", 1)
 
@@ -34,14 +40,26 @@ def test_the_id_follows_data_and_results_version():
 
 
 @pytest.mark.parametrize(
-    "target", ["os.system", "logging.os.system", "builtins.eval", "subprocess.run", "vlgs", "vlgs.x;y", "", "torch"]
+    "target",
+    [
+        "os.system",
+        "logging.os.system",
+        "builtins.eval",
+        "subprocess.run",
+        "vlgs",
+        "vlgs.x;y",
+        "",
+        "torch",
+    ],
 )
 def test_foreign_targets_are_refused(target: str):
     bad = config(codec={"inner": [{"_target_": target}]})
     if target in ("vlgs", "torch"):
         check_targets(bad)  # a package name is trusted; constructing it fails in Hydra
         return
-    with pytest.raises(ValueError, match=r"codec\.inner\.0\._target_ must name something in vlgs, torch, lightning"):
+    with pytest.raises(
+        ValueError, match=r"codec\.inner\.0\._target_ must name something in vlgs, torch, lightning"
+    ):
         check_targets(bad)
 
 
@@ -56,7 +74,14 @@ def test_a_trusted_name_that_leads_elsewhere_is_refused():
 
 
 def test_no_source_runs_code_from_data():
-    forbidden = ("eval(", "exec(", "pickle.load", "allow_pickle=True", "weights_only=False", "yaml.load(")
+    forbidden = (
+        "eval(",
+        "exec(",
+        "pickle.load",
+        "allow_pickle=True",
+        "weights_only=False",
+        "yaml.load(",
+    )
     for path in (Path(__file__).parents[2] / "vlgs").rglob("*.py"):
         text = path.read_text().replace("model.eval(", "").replace(".eval()", "")
         found = [word for word in forbidden if word in text]

@@ -10,7 +10,9 @@ from vlgs.module.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 
 
 def example(step: int) -> Checkpoint:
-    return Checkpoint(step, {"a": torch.full((3, 2), float(step)), "n": torch.tensor(step)}, {"k": [1, "x"]})
+    return Checkpoint(
+        step, {"a": torch.full((3, 2), float(step)), "n": torch.tensor(step)}, {"k": [1, "x"]}
+    )
 
 
 def test_round_trip_keeps_bits_and_meta(tmp_path: Path):
@@ -51,7 +53,7 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path):
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(bytes(data))
-    with pytest.raises(ValueError, match="must hold a readable file.*digest"):
+    with pytest.raises(ValueError, match=r"must hold a readable file.*digest"):
         load_checkpoint(tmp_path)
 
 
@@ -79,7 +81,9 @@ def test_a_full_disk_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: pyte
     assert not list(tmp_path.glob(".*.tmp")), "the half-written file must not stay behind"
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a device that is always full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="needs /dev/full, a device that is always full"
+)
 def test_a_really_full_device_is_an_oserror(tmp_path: Path):
     from vlgs.files import write_atomically
 

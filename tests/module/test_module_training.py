@@ -68,7 +68,9 @@ def stop_at(module: VLGSModule, step: int) -> None:
 
 # 5: between densifications, statistics half gathered; 8: right after one; 13: after the reset; 17: after a degree joined.
 @pytest.mark.parametrize("stop", [5, 8, 13, 17])
-def test_resume_is_bit_identical_to_never_having_stopped(tiny_scene: Scene, tmp_path: Path, stop: int):
+def test_resume_is_bit_identical_to_never_having_stopped(
+    tiny_scene: Scene, tmp_path: Path, stop: int
+):
     whole = train(module_of(tiny_scene), tmp_path / "whole")
     first = module_of(tiny_scene)
     stop_at(first, stop)
@@ -76,11 +78,15 @@ def test_resume_is_bit_identical_to_never_having_stopped(tiny_scene: Scene, tmp_
     assert first.next_step == stop
     second = train(module_of(tiny_scene), tmp_path / "parts")
     assert second.next_step == 24
-    assert whole.model.count != len(tiny_scene.points), "the schedule must densify for this test to mean anything"
+    assert whole.model.count != len(tiny_scene.points), (
+        "the schedule must densify for this test to mean anything"
+    )
     assert_same_bits(whole, second)
 
 
-def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(tiny_scene: Scene, tmp_path: Path):
+def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
+    tiny_scene: Scene, tmp_path: Path
+):
     threads = torch.get_num_threads()
     try:
         modules = []
@@ -107,7 +113,9 @@ def test_training_lowers_the_loss(tiny_scene: Scene, tmp_path: Path):
     assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
 
 
-def test_a_non_finite_image_stops_with_a_name_and_keeps_the_checkpoint(tiny_scene: Scene, tmp_path: Path):
+def test_a_non_finite_image_stops_with_a_name_and_keeps_the_checkpoint(
+    tiny_scene: Scene, tmp_path: Path
+):
     module = module_of(tiny_scene, "trainer.checkpoint_every=4")
     original = module.target
 
@@ -118,7 +126,9 @@ def test_a_non_finite_image_stops_with_a_name_and_keeps_the_checkpoint(tiny_scen
         return target
 
     module.target = poisoned  # type: ignore[method-assign]
-    with pytest.raises(FloatingPointError, match=r"loss must be finite, got nan in step 9 with views \w+ and \w+"):
+    with pytest.raises(
+        FloatingPointError, match=r"loss must be finite, got nan in step 9 with views \w+ and \w+"
+    ):
         train(module, tmp_path)
     checkpoint = load_checkpoint(tmp_path / "checkpoint")
     assert checkpoint is not None
@@ -126,7 +136,10 @@ def test_a_non_finite_image_stops_with_a_name_and_keeps_the_checkpoint(tiny_scen
     assert all(value.isfinite().all() for value in checkpoint.tensors.values())
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "sh0", "opacity_logits", "indicator_logits", "features"])
+@pytest.mark.parametrize(
+    "name",
+    ["means", "quats", "log_scales", "sh0", "opacity_logits", "indicator_logits", "features"],
+)
 def test_a_non_finite_gradient_names_its_row(tiny_scene: Scene, tmp_path: Path, name: str):
     module = module_of(tiny_scene)
 
@@ -136,14 +149,19 @@ def test_a_non_finite_gradient_names_its_row(tiny_scene: Scene, tmp_path: Path, 
         return gradient
 
     module.model.splats[name].register_hook(poison)
-    with pytest.raises(FloatingPointError, match=rf"gradient of splats\.{name} must be finite, .* in row 7 in step 0"):
+    with pytest.raises(
+        FloatingPointError,
+        match=rf"gradient of splats\.{name} must be finite, .* in row 7 in step 0",
+    ):
         train(module, tmp_path)
 
 
 def test_a_view_that_sees_nothing_trains_on(tiny_scene: Scene, tmp_path: Path):
     away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # looks the other way
     blind = tuple(
-        replace(view, camera=replace(view.camera, viewmat=away @ view.camera.viewmat)) if i == 0 else view
+        replace(view, camera=replace(view.camera, viewmat=away @ view.camera.viewmat))
+        if i == 0
+        else view
         for i, view in enumerate(tiny_scene.train)
     )
     module = train(module_of(replace(tiny_scene, train=blind)), tmp_path)
@@ -160,11 +178,13 @@ def test_a_scene_without_language_trains_colour_only(tiny_scene: Scene, tmp_path
     )
     module = train(module_of(silent), tmp_path)
     assert module.skips.blends_done == 0
-    assert torch.equal(module.model.splats["features"], torch.zeros_like(module.model.splats["features"]))
+    assert torch.equal(
+        module.model.splats["features"], torch.zeros_like(module.model.splats["features"])
+    )
 
 
 def test_no_training_views_is_refused(tiny_scene: Scene):
-    with pytest.raises(ValueError, match="training views of .* must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"training views of .* must be at least 1, got 0"):
         module_of(replace(tiny_scene, train=()))
 
 
@@ -174,7 +194,9 @@ def test_one_view_is_enough(tiny_scene: Scene, tmp_path: Path):
 
 
 @pytest.mark.parametrize("blend", ["blend=none", "loss.blend_weight=0.0"])
-def test_a_blended_view_without_weight_is_not_rendered(tiny_scene: Scene, tmp_path: Path, blend: str):
+def test_a_blended_view_without_weight_is_not_rendered(
+    tiny_scene: Scene, tmp_path: Path, blend: str
+):
     module = train(module_of(tiny_scene, blend), tmp_path)
     assert module.skips.blends_done == 0
 

@@ -39,7 +39,16 @@ def test_a_run_leaves_everything_the_manual_promises(finished: Path):
     metrics = json.loads(folder.metrics.read_text())
     kinds = {f"miou_{kind}" for kind in ("translucent_reflective", "other")}
     assert set(metrics) - kinds <= set(METRICS)
-    for name in ("psnr", "ssim", "miou", "loc_acc", "fps_color", "fps_language", "fps_query", "train_seconds"):
+    for name in (
+        "psnr",
+        "ssim",
+        "miou",
+        "loc_acc",
+        "fps_color",
+        "fps_language",
+        "fps_query",
+        "train_seconds",
+    ):
         assert metrics[name] is not None
         assert metrics[name] >= 0
     assert metrics["protocol"] == "dense@1 split=synthetic"
@@ -50,7 +59,14 @@ def test_a_run_leaves_everything_the_manual_promises(finished: Path):
     assert (folder.renders / "overview.png").is_file()
     views = [path for path in folder.renders.iterdir() if path.is_dir()]
     assert len(views) == 2
-    pictures = {"photograph", "render", "features", "labels", "prediction", "indicator_minus_opacity"}
+    pictures = {
+        "photograph",
+        "render",
+        "features",
+        "labels",
+        "prediction",
+        "indicator_minus_opacity",
+    }
     for view in views:
         names = {path.stem for path in view.iterdir()}
         assert names >= pictures
@@ -59,16 +75,22 @@ def test_a_run_leaves_everything_the_manual_promises(finished: Path):
     assert folder.curves.read_text().splitlines()[0].startswith("step,loss,psnr,n_gaussians")
 
 
-def test_a_finished_run_is_reported_not_repeated(finished: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_finished_run_is_reported_not_repeated(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+):
     folder = only_run(finished)
-    before = {path: path.stat().st_mtime_ns for path in folder.path.rglob("*") if path.name != ".lock"}
+    before = {
+        path: path.stat().st_mtime_ns for path in folder.path.rglob("*") if path.name != ".lock"
+    }
     assert run(composed(*SHORT, f"results={finished}", "threads=1", "pictures=false")) == 0
     assert "PSNR" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 def test_an_existing_run_can_be_refused(finished: Path):
-    with pytest.raises(FileExistsError, match=r"must not exist with on_existing=refuse; on_existing=resume goes on"):
+    with pytest.raises(
+        FileExistsError, match=r"must not exist with on_existing=refuse; on_existing=resume goes on"
+    ):
         run(composed(*SHORT, f"results={finished}", "on_existing=refuse"))
 
 
@@ -109,8 +131,17 @@ def test_a_word_that_the_vocabulary_lacks_ends_the_run_before_training(tmp_path:
 
 
 def test_ctrl_c_saves_says_how_to_go_on_and_goes_on(tmp_path: Path):
-    overrides = (*TINY, "trainer=smoke", "trainer.iterations=4000", f"results={tmp_path}", "trainer.log_every=1", "pictures=false")
-    process = subprocess.Popen(command(*overrides), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    overrides = (
+        *TINY,
+        "trainer=smoke",
+        "trainer.iterations=4000",
+        f"results={tmp_path}",
+        "trainer.log_every=1",
+        "pictures=false",
+    )
+    process = subprocess.Popen(
+        command(*overrides), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 240
     logs: list[Path] = []
     while not (logs and len(logs[0].read_text().splitlines()) > 3) and time.monotonic() < deadline:
@@ -120,7 +151,10 @@ def test_ctrl_c_saves_says_how_to_go_on_and_goes_on(tmp_path: Path):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    match = re.search(r"SIGINT: stopped and saved at step (\d+) of 4000; the same command goes on from there", errors)
+    match = re.search(
+        r"SIGINT: stopped and saved at step (\d+) of 4000; the same command goes on from there",
+        errors,
+    )
     assert match, errors
     assert "python -m vlgs.run" in errors
     from vlgs.module.checkpoint import load_checkpoint
@@ -136,17 +170,26 @@ def test_ctrl_c_saves_says_how_to_go_on_and_goes_on(tmp_path: Path):
         ("fusion=sel", ["Could not find 'fusion/sel'", "self", "none", "mlp", "cross"]),
         ("fusion.dmi=3", ["dmi", "not in struct"]),
         ("seed=0.5.5", ["seed"]),
-        ("fusion._target_=os.system", ["error: config: fusion._target_ must name something in vlgs, torch, lightning"]),
+        (
+            "fusion._target_=os.system",
+            ["error: config: fusion._target_ must name something in vlgs, torch, lightning"],
+        ),
         ("data=colmap", ["data.root"]),
         ("data=colmap data.root=/nowhere/at/all", ["error:", "/nowhere/at/all", "sparse"]),
-        ("on_existing=overwrite", ["error: config: on_existing must be resume or refuse, got overwrite"]),
+        (
+            "on_existing=overwrite",
+            ["error: config: on_existing must be resume or refuse, got overwrite"],
+        ),
         ("trainer.iterations=0", ["error: trainer: iterations must be at least 1, got 0"]),
     ],
 )
 def test_bad_input_is_one_clear_error(tmp_path: Path, override: str, words: list[str]):
     extra = [] if "data=" in override else list(TINY)
     done = subprocess.run(
-        command(*extra, *override.split(), f"results={tmp_path}"), capture_output=True, text=True, timeout=240
+        command(*extra, *override.split(), f"results={tmp_path}"),
+        capture_output=True,
+        text=True,
+        timeout=240,
     )
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
@@ -160,15 +203,32 @@ def test_help_is_a_manual_and_needs_no_torch():
         "try:\n    vlgs.run.main()\nexcept SystemExit:\n    pass\n"
         "print('torch' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
     assert done.stdout.rstrip().endswith("False"), "--help must stay light"
-    for section in ("NAME", "SYNOPSIS", "EXAMPLES", "GROUPS", "FILES", "EXIT STATUS", "fusion: cross, mlp, none, self"):
+    for section in (
+        "NAME",
+        "SYNOPSIS",
+        "EXAMPLES",
+        "GROUPS",
+        "FILES",
+        "EXIT STATUS",
+        "fusion: cross, mlp, none, self",
+    ):
         assert section in done.stdout
 
 
 def test_a_multirun_makes_one_run_per_combination(tmp_path: Path):
     done = subprocess.run(
-        command("-m", *SHORT, "trainer.iterations=3", "blend=none,fixed", f"results={tmp_path}", "pictures=false"),
+        command(
+            "-m",
+            *SHORT,
+            "trainer.iterations=3",
+            "blend=none,fixed",
+            f"results={tmp_path}",
+            "pictures=false",
+        ),
         capture_output=True,
         text=True,
         timeout=300,

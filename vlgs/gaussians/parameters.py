@@ -65,7 +65,7 @@ class _Logistic(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, d_y: Tensor) -> Tensor:
+    def backward(ctx: Any, d_y: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         (y,) = ctx.saved_tensors
         return d_y * y * (1 - y)
 

@@ -21,7 +21,12 @@ class Densification(L.Callback):
     """Clone, split, prune and reset, from the two real views of each iteration (systems.md A.1, D.10, D.11)."""
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Gather the screen gradients of this iteration, then change the Gaussians when it is time."""
         module = _own(pl_module)
@@ -29,12 +34,20 @@ class Densification(L.Callback):
         if done >= config.densify.stop:
             return
         state, views = module.densify_state, module.sampler.pair(done - 1)
-        for index, gradient, render in zip(views, module.screen_gradients, module.report.renders, strict=True):
+        for index, gradient, render in zip(
+            views, module.screen_gradients, module.report.renders, strict=True
+        ):
             camera = module.scene.train[index].camera
             state.accumulate(gradient, render.visible, camera.width, camera.height)
         if config.densify.densifies_at(done):
             densify(
-                module.model.splats, module.optimizer, state, config, module.extent, module.seed, done
+                module.model.splats,
+                module.optimizer,
+                state,
+                config,
+                module.extent,
+                module.seed,
+                done,
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)
@@ -49,7 +62,12 @@ class Checkpoints(L.Callback):
         self.meta = meta
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Save when it is time; the last iteration is saved by `on_train_end`."""
         module = _own(pl_module)
@@ -74,7 +92,12 @@ class TrainingClock(L.Callback):
         self.started = time.perf_counter()
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Add this iteration and its densification."""
         _own(pl_module).train_seconds += time.perf_counter() - self.started
@@ -95,12 +118,19 @@ class CurveLog(L.Callback):
         rows: list[list[str]] = []
         if self.path.is_file() and module.next_step > 0:
             with self.path.open(newline="") as file:
-                rows = [row for row in list(csv.reader(file))[1:] if int(row[0]) <= module.next_step]
+                rows = [
+                    row for row in list(csv.reader(file))[1:] if int(row[0]) <= module.next_step
+                ]
         with self.path.open("w", newline="") as file:
             csv.writer(file).writerows([list(self.COLUMNS), *rows])
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Write a row when it is time."""
         module = _own(pl_module)
@@ -115,7 +145,9 @@ class CurveLog(L.Callback):
             "seconds": module.train_seconds,
         }
         with self.path.open("a", newline="") as file:
-            csv.writer(file).writerow([module.next_step, *(f"{value:.6g}" for value in row.values())])
+            csv.writer(file).writerow(
+                [module.next_step, *(f"{value:.6g}" for value in row.values())]
+            )
         for logger in trainer.loggers:
             logger.log_metrics({k: float(v) for k, v in row.items()}, step=module.next_step)
 
@@ -124,13 +156,21 @@ class ProgressLine(L.Callback):
     """A progress bar with loss, PSNR, number of Gaussians and time left; redrawn at most four times a second."""
 
     def __init__(self) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
 
         self.bar = Progress(
             TextColumn("training"),
             BarColumn(bar_width=24),
             MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]:,} Gaussians"),
+            TextColumn(
+                "loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]:,} Gaussians"
+            ),
             TimeRemainingColumn(compact=True),
             TextColumn("left"),
             auto_refresh=False,
@@ -142,23 +182,39 @@ class ProgressLine(L.Callback):
         """Show the bar."""
         module = _own(pl_module)
         self.task = self.bar.add_task(
-            "", total=module.settings.iterations, completed=module.next_step, loss=0.0, psnr=0.0, count=module.model.count
+            "",
+            total=module.settings.iterations,
+            completed=module.next_step,
+            loss=0.0,
+            psnr=0.0,
+            count=module.model.count,
         )
         self.bar.start()
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Redraw when a quarter of a second has passed."""
         module = _own(pl_module)
         report = module.report
-        self.mse = report.color_mse if self.mse is None else 0.95 * self.mse + 0.05 * report.color_mse
+        self.mse = (
+            report.color_mse if self.mse is None else 0.95 * self.mse + 0.05 * report.color_mse
+        )
         now = time.monotonic()
         if now - self.drawn < 0.25 and module.next_step < module.settings.iterations:
             return
         self.drawn = now
         self.bar.update(
-            self.task, completed=module.next_step, loss=report.loss, psnr=psnr_of(self.mse), count=module.model.count
+            self.task,
+            completed=module.next_step,
+            loss=report.loss,
+            psnr=psnr_of(self.mse),
+            count=module.model.count,
         )
         self.bar.refresh()
 
@@ -166,7 +222,9 @@ class ProgressLine(L.Callback):
         """Leave the last state on the screen."""
         self.bar.stop()
 
-    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
         """Give the terminal back."""
         self.bar.stop()
 
@@ -198,7 +256,9 @@ class GracefulStop(L.Callback):
         """Give the signals back."""
         self._release()
 
-    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
         """Give the signals back."""
         self._release()
 

@@ -205,16 +205,21 @@ class VLGSModule(L.LightningModule):
         """Gradients of everything; returns those of the screen positions, per view, that feed densification."""
         screen = [render.mean2d for render in renders]
         if self.gaussians_config.densify_on == "rgb":
-            color = torch.autograd.grad(sum(color_losses, torch.zeros(())), screen, retain_graph=True)
+            color = torch.autograd.grad(
+                sum(color_losses, torch.zeros(())), screen, retain_graph=True
+            )
             total.backward()
             return color
         total.backward()
-        return tuple(mean2d.grad if mean2d.grad is not None else torch.zeros_like(mean2d) for mean2d in screen)
+        return tuple(
+            mean2d.grad if mean2d.grad is not None else torch.zeros_like(mean2d)
+            for mean2d in screen
+        )
 
     def _blended_loss(
         self, step: int, first: Target, second: Target, fused: FusedGaussians
     ) -> tuple[Tensor | None, float]:
-        """lambda * L_b of Eq. blend and its weight; None where it is not needed."""
+        """Third term of Eq. overall and its weight; None where it is not needed."""
         if not self.blend.active or first.codes is None or second.codes is None:
             return None, 0.0
         assert first.valid is not None
@@ -249,7 +254,7 @@ class VLGSModule(L.LightningModule):
             gradient = parameter.grad
             if gradient is None or torch.isfinite(gradient.sum()):
                 continue
-            rows = (~torch.isfinite(gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None]))
+            rows = ~torch.isfinite(gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None])
             if rows.any():  # a sum can overflow where every term is finite
                 row = int(rows.any(dim=1).nonzero()[0])
                 raise FloatingPointError(

@@ -58,7 +58,9 @@ def _restore_model(module: VLGSModule, tensors: dict[str, Tensor]) -> None:
     expected = set(module.model.state_dict())
     if expected != set(tensors):
         odd = sorted(expected.symmetric_difference(tensors))
-        raise ValueError(f"resume: checkpoint must hold the tensors of this model, got a difference in {odd}")
+        raise ValueError(
+            f"resume: checkpoint must hold the tensors of this model, got a difference in {odd}"
+        )
     for group in module.optimizer.param_groups:
         name = group["name"]
         if name in module.model.splats:
