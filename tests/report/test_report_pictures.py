@@ -192,3 +192,10 @@ def test_object_labels_alone_give_prompts_but_no_class_map():
     pictures = painter.draw(labelled.test[0], 6)
     assert set(pictures.prompts) == {"wine glass", "steel kettle", "red apple"}
     assert pictures.labels is None
+
+
+def test_without_language_only_colour_is_drawn(tmp_path: Path):
+    silent = replace(scene(), mask_vectors=torch.zeros(0, 8), mask_areas=torch.zeros(0))
+    write_pictures(tmp_path, FakeModel(), silent, QUERY, None)
+    names = {path.name for path in tmp_path.rglob("*.png")}
+    assert names == {"overview.png", "photograph.png", "render.png"}

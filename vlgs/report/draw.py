@@ -34,8 +34,9 @@ class ViewPictures:
     name: str
     photograph: UInt8[Tensor, "h w 3"]
     render: UInt8[Tensor, "h w 3"]
-    features: UInt8[Tensor, "h w 3"]
-    difference: UInt8[Tensor, "h w 3"]
+    features: UInt8[Tensor, "h w 3"] | None = None
+    """Like `difference`, None where no language was trained."""
+    difference: UInt8[Tensor, "h w 3"] | None = None
     """l - o as seen from the view (fig. lancity-vis)."""
     labels: UInt8[Tensor, "h w 3"] | None = None
     """True classes, where the view has one for every pixel."""
@@ -69,6 +70,7 @@ class Painter:
     ) -> None:
         self.model, self.scene, self.query, self.prompts = model, scene, query, prompts
         self.fused: Fused = model.fuse()
+        self.has_language = len(scene.mask_vectors) > 0
         self.feature_colors = fit_feature_colors(
             answer_view(model, view.camera, None, self.fused).feature for view in views
         )
@@ -82,9 +84,13 @@ class Painter:
             name=view.name,
             photograph=view.read_image(),
             render=colors.to_uint8(answer.color),
-            features=paint_features(answer.feature, self.feature_colors),
-            difference=colors.diverging(self.indicator_difference(view.camera)),
         )
+        if self.has_language:
+            pictures = replace(
+                pictures,
+                features=paint_features(answer.feature, self.feature_colors),
+                difference=colors.diverging(self.indicator_difference(view.camera)),
+            )
         if self.prompts is None:
             return pictures
         truth = read_truth(view)

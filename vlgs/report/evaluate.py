@@ -83,7 +83,7 @@ def prompts_of(scene: Scene, query: Query, text: TextEncoder | None) -> tuple[Pr
     if not scene.classes:
         return None, "the scene names no classes"
     if text is None:
-        return None, "there is no text encoder"
+        return None, "no language was trained, or there is no vocabulary"
     try:
         return encode_prompts(query, text, scene.classes), ""
     except (ValueError, FileNotFoundError, ImportError) as error:

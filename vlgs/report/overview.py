@@ -86,9 +86,9 @@ def _tiles(row: ViewPictures) -> dict[str, _Tile]:
     tiles = {
         PHOTOGRAPH: _Tile(row.photograph),
         RENDER: _Tile(row.render),
-        FEATURES: _Tile(row.features),
-        DIFFERENCE: _Tile(row.difference),
     }
+    if row.features is not None and row.difference is not None:
+        tiles |= {FEATURES: _Tile(row.features), DIFFERENCE: _Tile(row.difference)}
     if row.labels is not None and row.prediction is not None:
         tiles |= {LABELS: _Tile(row.labels), PREDICTION: _Tile(row.prediction)}
     if row.prompts:
@@ -110,7 +110,8 @@ class _Sheet:
         columns = [c for c in COLUMNS if any(c in row for row in tiles)]
         heights = [TILE * row.photograph.shape[0] / row.photograph.shape[1] for row in rows]
         self.width = 2 * MARGIN + len(columns) * (TILE + GAP)
-        self.height = 2 * MARGIN + sum(heights) + GAP * len(rows) + FOOT
+        foot = FOOT if DIFFERENCE in columns else 0
+        self.height = 2 * MARGIN + sum(heights) + GAP * len(rows) + foot
         self.figure = Figure(figsize=(self.width, self.height))
         y = MARGIN
         for i, row in enumerate(tiles):
@@ -122,6 +123,8 @@ class _Sheet:
                     self._text(self._left(j) + TILE / 2, y - 0.12, column, size=9)
             self._text(MARGIN - 0.13, y + heights[i] / 2, rows[i].name, size=7, rotation=90)
             y += heights[i] + GAP
+        if DIFFERENCE not in columns:
+            return
         shown = sorted({i for row in rows for i in row.classes})
         self._legend(scene, shown, y + 0.1, columns=len(columns) - 3)
         if RELEVANCY in columns:

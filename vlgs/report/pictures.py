@@ -45,7 +45,8 @@ def write_pictures(
         model: The trained scene.
         scene: Its held-out views and labels.
         query: How relevancy is computed.
-        prompts: The scene's classes, encoded; without them only colour, features and l - o are drawn.
+        prompts: The scene's classes, encoded; without them only colour, features and l - o are drawn, and
+            colour alone where no language was trained.
         limits: How many views and prompts.
 
     Returns:
@@ -65,7 +66,8 @@ def write_pictures(
         if view.name in on_overview:
             rows.append(pictures)
     density = count_difference(painter.fused.language_weight, painter.fused.gaussians.opacities)
-    write_histogram(folder / "indicator_minus_opacity.png", density)
+    if painter.has_language:
+        write_histogram(folder / "indicator_minus_opacity.png", density)
     path = folder / "overview.png"
     write_overview(path, scene, rows, density)
     return path
