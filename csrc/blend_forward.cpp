@@ -1,0 +1,206 @@
+// Front-to-back compositing, one 4x4 block of pixels at a time: image = sum_i f_i a_i T_i, T_i = prod_{j<i}
+// (1 - a_j).
+#include "alpha.h"
+
+namespace vlgs::VLGS_ISA_NS {
+namespace {
+
+template <class T>
+struct Tile {
+  const Pass<T> *pass;
+  int64_t index, begin, count;  // its list is entries [begin, begin + count)
+  const T *records;             // of its list
+  uint32_t *list;               // places in its list that reach the block at hand
+  T *weights;                   // [kMaxChains, kWeightsAhead, kLanes]
+  T *sums;                      // [channels, kLanes]
+};
+
+template <class T, int kChains>
+struct Rays {
+  Pack<T> transmittance[kChains];  // negative once a pixel has stopped before its threshold
+  Pack<T> last[kChains];
+};
+
+// The weights a_i T_i of one Gaussian in all chains; false once every pixel is done in every chain.
+template <class T, int kChains, bool kBefore>
+VLGS_INLINE bool weigh(const Pass<T> &p, const T *g, const Centres<T> &at, uint32_t place,
+                       Rays<T, kChains> &rays, Pack<T> *weights) {
+  const Pack<T> floor = splat(kBefore ? T(0) : p.transmittance_min);
+  Mask<T> done[kChains];
+  for (int c = 0; c < kChains; ++c) done[c] = rays.transmittance[c] <= floor;
+  Mask<T> all_done = done[0];
+  for (int c = 1; c < kChains; ++c) all_done = all_done & done[c];
+  if (!any(~all_done)) return false;
+
+  const Offset<T> o = offset(g, at.x, at.y);
+  const Pack<T> falloff = exp2_of_minus(o.exponent);
+  const Pack<T> zero = splat(T(0));
+  for (int c = 0; c < kChains; ++c) {
+    const T *chain = g + kChains0 + 2 * c;
+    Mask<T> reached = (o.exponent <= splat(chain[kCutoff])) & ~done[c];
+    const Pack<T> alpha = min(splat(chain[kWeight]) * falloff, splat(p.alpha_max));
+    Pack<T> &t = rays.transmittance[c];
+    Pack<T> weight = alpha * t;
+    const Pack<T> after = fnma(alpha, t, t);
+    if constexpr (kBefore) {
+      const Mask<T> crosses = reached & (after <= splat(p.transmittance_min));
+      reached = reached & ~crosses;
+      t = select(crosses, zero - t, t);
+    }
+    t = select(reached, after, t);
+    rays.last[c] = select(reached, splat(T(place)), rays.last[c]);
+    weights[c] = select(reached, weight, zero);
+  }
+  return true;
+}
+
+template <class T, int kChains>
+inline Rays<T, kChains> start_rays(const Pass<T> &p, const Centres<T> &at) {
+  // Lanes beyond the image are done before they begin.
+  const Mask<T> inside = (at.x <= splat(T(p.grid.width))) & (at.y <= splat(T(p.grid.height)));
+  Rays<T, kChains> rays;
+  for (int c = 0; c < kChains; ++c) {
+    rays.transmittance[c] = select(inside, splat(T(1)), splat(T(0)));
+    rays.last[c] = splat(T(-1));
+  }
+  return rays;
+}
+
+// Three channels per chain, all in registers.
+template <class T, int kChains, bool kBefore>
+inline void sum_narrow(const Tile<T> &tile, const Centres<T> &at, int64_t reach, Rays<T, kChains> &rays) {
+  Pack<T> sums[3 * kChains];
+  for (auto &s : sums) s = splat(T(0));
+  for (int64_t j = 0; j < reach; ++j) {
+    const T *g = tile.records + int64_t(tile.list[j]) * kRecord;
+    Pack<T> weights[kChains];
+    if (!weigh<T, kChains, kBefore>(*tile.pass, g, at, tile.list[j], rays, weights)) break;
+    for (int c = 0; c < kChains; ++c)
+      for (int k = 0; k < 3; ++k)
+        sums[3 * c + k] = fma(weights[c], splat(g[kValues + 3 * c + k]), sums[3 * c + k]);
+  }
+  for (int c = 0; c < 3 * kChains; ++c) store(tile.sums + c * kLanes, sums[c]);
+}
+
+template <class T, int kWidth>
+inline void add_channels(const Tile<T> &tile, const Part<T> &part, int64_t channel, int64_t first,
+                         int64_t count, T *sums) {
+  Pack<T> acc[kWidth];
+  for (int k = 0; k < kWidth; ++k) acc[k] = load(sums + k * kLanes);
+  for (int64_t j = 0; j < count; ++j) {
+    const uint32_t rank = tile.pass->ranks[tile.begin + tile.list[first + j]];
+    const T *values = part.values + int64_t(tile.pass->ids[rank]) * part.channels + channel;
+    const Pack<T> weight = load(tile.weights + (part.chain * kWeightsAhead + j) * kLanes);
+    for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, splat(values[k]), acc[k]);
+  }
+  for (int k = 0; k < kWidth; ++k) store(sums + k * kLanes, acc[k]);
+}
+
+// Any number of channels: weights of a stretch of the list first, then the channels by eight, four, two and
+// one.
+template <class T, int kChains, bool kBefore>
+inline void sum_wide(const Tile<T> &tile, const Centres<T> &at, int64_t reach, Rays<T, kChains> &rays) {
+  const Pass<T> &p = *tile.pass;
+  for (int64_t i = 0; i < p.channels * kLanes; ++i) tile.sums[i] = 0;
+  bool going = true;
+  for (int64_t first = 0; first < reach && going; first += kWeightsAhead) {
+    int64_t count = 0;
+    for (; count < kWeightsAhead && first + count < reach; ++count) {
+      const uint32_t place = tile.list[first + count];
+      Pack<T> weights[kChains];
+      going =
+          weigh<T, kChains, kBefore>(p, tile.records + int64_t(place) * kRecord, at, place, rays, weights);
+      if (!going) break;
+      for (int c = 0; c < kChains; ++c)
+        store(tile.weights + (c * kWeightsAhead + count) * kLanes, weights[c]);
+    }
+    T *sums = tile.sums;
+    for (int i = 0; i < p.num_parts; ++i) {
+      const Part<T> &part = p.parts[i];
+      int64_t k = 0;
+      for (; k + 8 <= part.channels; k += 8, sums += 8 * kLanes)
+        add_channels<T, 8>(tile, part, k, first, count, sums);
+      if (part.channels & 4)
+        add_channels<T, 4>(tile, part, k, first, count, sums), k += 4, sums += 4 * kLanes;
+      if (part.channels & 2)
+        add_channels<T, 2>(tile, part, k, first, count, sums), k += 2, sums += 2 * kLanes;
+      if (part.channels & 1) add_channels<T, 1>(tile, part, k, first, count, sums), sums += kLanes;
+    }
+  }
+}
+
+template <class T>
+void write_block(const Tile<T> &tile, int b, const T *transmittance) {
+  const Pass<T> &p = *tile.pass;
+  const int64_t x0 = tile.index % p.grid.tiles_x * kTile + b % 4 * kBlock;
+  const int64_t y0 = tile.index / p.grid.tiles_x * kTile + b / 4 * kBlock;
+  for (int l = 0; l < kLanes; ++l) {
+    const int64_t x = x0 + l % 4, y = y0 + l / 4;
+    if (x >= p.grid.width || y >= p.grid.height) continue;
+    const int64_t pixel = y * p.grid.width + x;
+    const T *sums = tile.sums;
+    for (int i = 0; i < p.num_parts; ++i) {
+      const Part<T> &part = p.parts[i];
+      for (int64_t k = 0; k < part.channels; ++k, sums += kLanes)
+        part.image[pixel * part.channels + k] = sums[l];
+    }
+    for (int c = 0; c < p.chains; ++c) p.alphas[c][pixel] = 1 - transmittance[c * kLanes + l];
+  }
+}
+
+template <class T, int kChains, bool kBefore>
+void blend_tile(const Tile<T> &tile) {
+  const Pass<T> &p = *tile.pass;
+  for (int b = 0; b < kBlocks; ++b) {
+    int64_t reach = 0;
+    for (int64_t k = 0; k < tile.count; ++k) {
+      tile.list[reach] = uint32_t(k);
+      reach += (p.masks[tile.begin + k] >> b) & 1;
+    }
+    const Centres<T> at = centres<T>(p.grid, tile.index, b);
+    Rays<T, kChains> rays = start_rays<T, kChains>(p, at);
+    if (p.narrow)
+      sum_narrow<T, kChains, kBefore>(tile, at, reach, rays);
+    else
+      sum_wide<T, kChains, kBefore>(tile, at, reach, rays);
+
+    T final[kChains * kLanes];
+    const int64_t where = ((tile.index * kChains) * kBlocks + b) * kLanes;
+    for (int c = 0; c < kChains; ++c) {
+      Pack<T> t = rays.transmittance[c];
+      if constexpr (kBefore) t = select(t <= splat(T(0)), splat(T(0)) - t, t);
+      store(final + c * kLanes, t);
+      store(p.transmittance + where + c * kBlocks * kLanes, t);
+      store(p.last + where + c * kBlocks * kLanes, rays.last[c]);
+    }
+    write_block(tile, b, final);
+  }
+}
+
+}  // namespace
+
+template <class T>
+int64_t blend_scratch(const Pass<T> &p, int64_t list_length) {
+  return list_length * kRecord + kMaxChains * kWeightsAhead * kLanes + p.channels * kLanes;
+}
+
+template <class T>
+void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
+  const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin;
+  Carver<T> carver{scratch};
+  T *records = carver.take(count * kRecord);
+  gather_records(p, begin, begin + count, records);
+  T *weights = carver.take(kMaxChains * kWeightsAhead * kLanes);
+  const Tile<T> tile{&p, index, begin, count, records, list, weights, carver.take(p.channels * kLanes)};
+  if (p.chains == 1)
+    p.stop_before ? blend_tile<T, 1, true>(tile) : blend_tile<T, 1, false>(tile);
+  else
+    p.stop_before ? blend_tile<T, 2, true>(tile) : blend_tile<T, 2, false>(tile);
+}
+
+template int64_t blend_scratch(const Pass<float> &, int64_t);
+template int64_t blend_scratch(const Pass<double> &, int64_t);
+template void blend(const Pass<float> &, int64_t, float *, uint32_t *);
+template void blend(const Pass<double> &, int64_t, double *, uint32_t *);
+
+}  // namespace vlgs::VLGS_ISA_NS

@@ -1,0 +1,30 @@
+// The kernels of one instruction set; see kernels.h for what they do.
+#pragma once
+
+#include "kernels.h"
+
+#if !defined(VLGS_ISA_NS)
+#error "compile the kernels with -DVLGS_ISA_NS=<name>"
+#endif
+
+namespace vlgs::VLGS_ISA_NS {
+
+template <class T>
+void project(const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end);
+template <class T>
+void project_backward(const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end);
+template <class T>
+void cover(Grid, const T *record, T cutoff, Box, uint16_t *masks);
+template <class T>
+int64_t blend_scratch(const Pass<T> &, int64_t list_length);
+template <class T>
+int64_t backward_scratch(const Pass<T> &, int64_t list_length);
+template <class T>
+void blend(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
+template <class T>
+bool blend_backward(const Pass<T> &, int64_t tile, T *scratch, T *slots);
+
+extern const Kernels<float> kFloat;
+extern const Kernels<double> kDouble;
+
+}  // namespace vlgs::VLGS_ISA_NS

@@ -1,0 +1,140 @@
+// What the kernels work on, and the list of them. They know arrays and nothing else: no Python, no threads,
+// no allocation. Every kernel is compiled once per instruction set, into that set's namespace, and chosen at
+// run time (dispatch.cpp).
+//
+// Matrices are row by row. n Gaussians in the caller's order; m visible ones in the order of (depth, row),
+// "ranks".
+#pragma once
+
+#include <cstdint>
+
+namespace vlgs {
+
+constexpr int kTile = 16;          // pixels on a side of a tile
+constexpr int kBlock = 4;          // pixels on a side of a block
+constexpr int kBlocks = 16;        // blocks of a tile, and bits of a block mask: row by row
+constexpr int kPixels = 16;        // pixels of a block, row by row
+constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
+constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
+constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
+
+// Exponents are in octaves: weight falls off as 2^-(u^2 + v^2) with u, v scaled by kOctaves = sqrt(log2(e) /
+// 2).
+constexpr double kOctaves = 0.849321800288019099;
+
+struct Camera {
+  double rotation[9], translation[3];  // world to camera
+  double fx, fy, cx, cy;               // pixels
+  double slope_low[2], slope_high[2];  // where x/z and y/z are clamped in the Jacobian
+  double near, blur;                   // world units; pixel^2
+};
+
+// On the image plane a Gaussian is an ellipse written row by row: given y, x is normal about
+// mean_x + slope (y - mean_y) with deviation sigma_x, and y is normal about mean_y with deviation sigma_y.
+template <class T>
+struct Splats {
+  T *mean2d;   // [n, 2] pixels
+  T *ellipse;  // [n, 3] (1 / sigma_x, slope, 1 / sigma_y)
+  T *depth;    // [n] world units; 0 marks a Gaussian that is culled
+};
+
+template <class T>
+struct Gaussians {
+  const T *means, *quats, *scales;  // [n, 3], [n, 4], [n, 3]
+};
+
+template <class T>
+struct GaussianGrads {
+  const T *depth;                   // [n] as the projection left it
+  const T *d_mean2d, *d_ellipse;    // [n, 2], [n, 3]: given
+  T *d_means, *d_quats, *d_scales;  // [n, 3], [n, 4], [n, 3]: written
+};
+
+struct Grid {
+  int64_t width, height;  // pixels
+  int64_t tiles_x, tiles_y;
+};
+
+// Tiles [x0, x1) x [y0, y1).
+struct Box {
+  int32_t x0, y0, x1, y1;
+};
+
+// A record: what the tile kernels read of a visible Gaussian, one cache line of floats.
+enum Record { kMeanX, kMeanY, kInvSigmaX, kSlope, kInvSigmaY, kChains0, kValues = kChains0 + 2 * kMaxChains };
+constexpr int kWeight = 0, kCutoff = 1;  // record[kChains0 + 2 chain + ...]
+
+// One group of channels; several may hang on one chain.
+template <class T>
+struct Part {
+  const T *values;   // [n, channels]
+  const T *d_image;  // [height, width, channels], backward only; null where the image was not used
+  T *image;          // [height, width, channels], forward only
+  int64_t channels;
+  int64_t padded;  // channels rounded up to 4, backward only
+  int64_t slot;    // where its gradients begin in a slot, backward only
+  int chain;
+  int group;  // for messages
+};
+
+// Everything a tile needs; one pass blends at most kMaxChains chains.
+template <class T>
+struct Pass {
+  Grid grid;
+  T alpha_max, transmittance_min;
+  bool stop_before;
+  int chains;
+  bool narrow;  // every chain has exactly 3 channels, held in the records
+  const Part<T> *parts;
+  int num_parts;
+  int64_t channels;  // of all parts
+  int64_t padded_channels;
+  bool shape_grad[kMaxChains];
+
+  const uint32_t *ids;        // [m] row of each rank
+  const T *records;           // [m, kRecord]
+  const int64_t *tile_begin;  // [tiles + 1] into ranks and masks
+  const uint32_t *ranks;
+  const uint16_t *masks;
+
+  T *alphas[kMaxChains];          // [height, width] accumulated weight, forward only
+  const T *d_alphas[kMaxChains];  // [height, width] or null, backward only
+  T *transmittance;               // [tiles, chains, kBlocks, kPixels] after the last contribution
+  T *last;                        // same shape: place in the tile's list of the last contribution, -1 without
+  int64_t slot_size;              // numbers in a slot, backward only
+};
+
+// A slot: gradients of one Gaussian from one tile. Moments are sums over pixels of h, the loss's derivative
+// by the negative exponent, times u, v, u^2, u v, v^2 (README.md). The channels of the parts follow.
+enum Slot {
+  kMomentU,
+  kMomentV,
+  kMomentUU,
+  kMomentUV,
+  kMomentVV,
+  kSlotWeight0,
+  kSlotValues = kSlotWeight0 + kMaxChains
+};
+constexpr int kSlotHead = 8;  // where wide channels begin
+
+template <class T>
+struct Kernels {
+  // Rows [begin, end).
+  void (*project)(const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end);
+  void (*project_backward)(const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end);
+  // Block masks of one Gaussian over the tiles of a box, row by row.
+  void (*cover)(Grid, const T *record, T cutoff, Box, uint16_t *masks);
+  // One tile; with scratch as large as its *_scratch says. Backward writes one slot per entry of the tile's
+  // list and says whether all it read was finite.
+  int64_t (*blend_scratch)(const Pass<T> &, int64_t list_length);
+  int64_t (*backward_scratch)(const Pass<T> &, int64_t list_length);
+  void (*blend)(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
+  bool (*blend_backward)(const Pass<T> &, int64_t tile, T *scratch, T *slots);
+};
+
+// The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.
+const char *isa();
+template <class T>
+const Kernels<T> &kernels();
+
+}  // namespace vlgs

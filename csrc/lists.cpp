@@ -1,0 +1,226 @@
+#include "lists.h"
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+#include <utility>
+
+#include "checks.h"
+
+namespace vlgs {
+namespace {
+
+template <class T>
+struct Candidate {
+  std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>
+      depth;  // bits of a positive number, which are in its order
+  uint32_t id;
+};
+
+// Where an ellipse may reach a pixel centre; empty if x0 >= x1. Inverse deviations are per octave, as in
+// records.
+template <class T>
+Box box_of(const Grid &grid, T mean_x, T mean_y, T inv_sigma_x, T slope, T inv_sigma_y, T cutoff) {
+  const double reach = std::sqrt(double(cutoff)), sigma_x = 1 / double(inv_sigma_x),
+               sigma_y = 1 / double(inv_sigma_y);
+  const double skew = double(slope) * sigma_y;
+  const double half_x = reach * std::sqrt(sigma_x * sigma_x + skew * skew) * (1 + 1e-5) + 1e-3;
+  const double half_y = reach * sigma_y * (1 + 1e-5) + 1e-3;
+  // Pixels from the one whose centre may lie just inside to one beyond the last; truncation is floor from 0
+  // on.
+  const double x0 = std::max(mean_x - half_x + 0.5, 0.0),
+               x1 = std::min(mean_x + half_x + 0.5, double(grid.width));
+  const double y0 = std::max(mean_y - half_y + 0.5, 0.0),
+               y1 = std::min(mean_y + half_y + 0.5, double(grid.height));
+  if (!(x0 < x1 && y0 < y1)) return {0, 0, 0, 0};
+  return {int32_t(x0) / kTile, int32_t(y0) / kTile, (int32_t(x1) + kTile - 1) / kTile,
+          (int32_t(y1) + kTile - 1) / kTile};
+}
+
+// Stable, least significant digit first. Each thread moves a fixed share of the input, so the result is the
+// one stable order.
+template <class T>
+void sort_by_depth(Buffer<Candidate<T>> &items, int64_t count, int threads) {
+  constexpr int kBits = 11, kDigits = 1 << kBits;
+  Buffer<Candidate<T>> other(count);
+  std::vector<int64_t> places(size_t(threads) * kDigits);
+  for (int shift = 0; shift < int(sizeof(T)) * 8; shift += kBits) {
+    const auto digit = [shift](const Candidate<T> &c) { return int(c.depth >> shift) & (kDigits - 1); };
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+    for (int t = 0; t < threads; ++t) {
+      int64_t *mine = places.data() + size_t(t) * kDigits;
+      std::fill(mine, mine + kDigits, 0);
+      const Range r = share(count, t, threads);
+      for (int64_t i = r.begin; i < r.end; ++i) ++mine[digit(items[i])];
+    }
+    int64_t place = 0;
+    for (int d = 0; d < kDigits; ++d)
+      for (int t = 0; t < threads; ++t) place += std::exchange(places[size_t(t) * kDigits + d], place);
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+    for (int t = 0; t < threads; ++t) {
+      int64_t *mine = places.data() + size_t(t) * kDigits;
+      const Range r = share(count, t, threads);
+      for (int64_t i = r.begin; i < r.end; ++i) other[mine[digit(items[i])]++] = items[i];
+    }
+    std::swap(items, other);
+  }
+}
+
+// Where a Gaussian is looked for, and the widest of its chains.
+template <class T>
+struct Extent {
+  Box box;
+  T cutoff;
+
+  int64_t tiles() const { return int64_t(box.x1 - box.x0) * (box.y1 - box.y0); }
+};
+
+template <class T>
+T widest(const DepthOrder<T> &order, int64_t n, int chains, int64_t i) {
+  T cutoff = order.cutoffs[i];
+  for (int c = 1; c < chains; ++c) cutoff = std::max(cutoff, order.cutoffs[c * n + i]);
+  return cutoff;
+}
+
+void check_budget(int64_t entries, int64_t bytes_each, int64_t budget) {
+  if (entries > budget / bytes_each)
+    throw std::invalid_argument(
+        "rasterize: tile lists must be within memory_budget = " + std::to_string(budget) + " bytes, got " +
+        std::to_string(entries) + " entries of " + std::to_string(bytes_each));
+}
+
+}  // namespace
+
+template <class T>
+DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
+                           const std::vector<const T *> &weights, T alpha_min, int threads) {
+  const int64_t chains = int64_t(weights.size());
+  DepthOrder<T> order{0, {}, Buffer<uint32_t>(n), Buffer<T>(chains * n)};
+  Buffer<Candidate<T>> candidates(n);
+  std::vector<int64_t> kept(threads);
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int t = 0; t < threads; ++t) {
+    const Range r = share(n, t, threads);
+    int64_t count = 0;
+    for (int64_t i = r.begin; i < r.end; ++i) {
+      for (int64_t c = 0; c < chains; ++c) {
+        const T w = weights[c][i];
+        order.cutoffs[c * n + i] = w >= alpha_min ? std::log2(w / alpha_min) : T(-1);
+      }
+      order.rank_of[i] = kCulled;
+      const T cutoff = widest(order, n, int(chains), i), *mean = splats.mean2d + 2 * i,
+              *e = splats.ellipse + 3 * i;
+      if (!(splats.depth[i] > 0 && cutoff >= 0)) continue;
+      const Box box = box_of(grid, mean[0], mean[1], e[0] * T(kOctaves), e[1], e[2] * T(kOctaves), cutoff);
+      if (box.x0 < box.x1)
+        candidates[r.begin + count++] = {std::bit_cast<decltype(Candidate<T>::depth)>(splats.depth[i]),
+                                         uint32_t(i)};
+    }
+    kept[t] = count;
+  }
+  for (int t = 0; t < threads; ++t) {
+    const Candidate<T> *from = candidates.data() + share(n, t, threads).begin;
+    std::copy(from, from + kept[t], candidates.data() + order.count);
+    order.count += kept[t];
+  }
+  sort_by_depth<T>(candidates, order.count, threads);
+  order.ids = Buffer<uint32_t>(order.count);
+#pragma omp parallel for num_threads(threads)
+  for (int64_t rank = 0; rank < order.count; ++rank) {
+    order.ids[rank] = candidates[rank].id;
+    order.rank_of[candidates[rank].id] = uint32_t(rank);
+  }
+  return order;
+}
+
+template <class T>
+TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, const T *records, int chains,
+                     int64_t budget, bool *visible, int threads) {
+  const int64_t tiles = grid.tiles_x * grid.tiles_y, m = order.count;
+  std::fill(visible, visible + n, false);
+
+  Buffer<Extent<T>> extents(m);
+  Buffer<int64_t> first(m + 1);  // of the masks of each rank
+#pragma omp parallel for num_threads(threads)
+  for (int64_t rank = 0; rank < m; ++rank) {
+    const T *g = records + rank * kRecord, cutoff = widest(order, n, chains, order.ids[rank]);
+    extents[rank] = {box_of(grid, g[kMeanX], g[kMeanY], g[kInvSigmaX], g[kSlope], g[kInvSigmaY], cutoff),
+                     cutoff};
+    first[rank + 1] = extents[rank].tiles();
+  }
+  first[0] = 0;
+  for (int64_t rank = 0; rank < m; ++rank) first[rank + 1] += first[rank];
+  check_budget(first[m], sizeof(uint16_t), budget);
+
+  // Masks over the boxes, and for every thread how many of each tile are not empty.
+  Buffer<uint16_t> masks(first[m]);
+  std::vector<int64_t> places(size_t(threads) * tiles);
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int t = 0; t < threads; ++t) {
+    int64_t *mine = places.data() + size_t(t) * tiles;
+    const Range r = share(m, t, threads);
+    for (int64_t rank = r.begin; rank < r.end; ++rank) {
+      const Extent<T> &e = extents[rank];
+      uint16_t *mask = masks.data() + first[rank];
+      kernels<T>().cover(grid, records + rank * kRecord, e.cutoff, e.box, mask);
+      bool reaches = false;
+      for (int64_t y = e.box.y0; y < e.box.y1; ++y)
+        for (int64_t x = e.box.x0; x < e.box.x1; ++x, ++mask) {
+          mine[y * grid.tiles_x + x] += *mask != 0;
+          reaches |= *mask != 0;
+        }
+      visible[order.ids[rank]] = reaches;
+    }
+  }
+
+  // Within a tile one thread's entries follow the other's, which keeps the order of depth.
+  TileLists lists;
+  lists.begin.resize(tiles + 1);
+  int64_t total = 0;
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    lists.begin[tile] = total;
+    for (int t = 0; t < threads; ++t) total += std::exchange(places[size_t(t) * tiles + tile], total);
+    lists.longest = std::max(lists.longest, total - lists.begin[tile]);
+  }
+  lists.begin[tiles] = total;
+  check_budget(total, sizeof(uint32_t) + sizeof(uint16_t), budget);
+  // Places in a list are kept as T.
+  if (lists.longest >= int64_t(1) << std::min(std::numeric_limits<T>::digits, 31))
+    throw std::invalid_argument("rasterize: Gaussians over one tile must be fewer than 2^24, got " +
+                                std::to_string(lists.longest));
+
+  lists.ranks = Buffer<uint32_t>(total);
+  lists.masks = Buffer<uint16_t>(total);
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int t = 0; t < threads; ++t) {
+    int64_t *mine = places.data() + size_t(t) * tiles;
+    const Range r = share(m, t, threads);
+    for (int64_t rank = r.begin; rank < r.end; ++rank) {
+      const Box &box = extents[rank].box;
+      const uint16_t *mask = masks.data() + first[rank];
+      for (int64_t y = box.y0; y < box.y1; ++y)
+        for (int64_t x = box.x0; x < box.x1; ++x, ++mask)
+          if (*mask) {
+            const int64_t place = mine[y * grid.tiles_x + x]++;
+            lists.ranks[place] = uint32_t(rank);
+            lists.masks[place] = *mask;
+          }
+    }
+  }
+  return lists;
+}
+
+template DepthOrder<float> sort_visible(const Grid &, int64_t, const Splats<float> &,
+                                        const std::vector<const float *> &, float, int);
+template DepthOrder<double> sort_visible(const Grid &, int64_t, const Splats<double> &,
+                                         const std::vector<const double *> &, double, int);
+template TileLists make_lists(const Grid &, int64_t, const DepthOrder<float> &, const float *, int, int64_t,
+                              bool *, int);
+template TileLists make_lists(const Grid &, int64_t, const DepthOrder<double> &, const double *, int, int64_t,
+                              bool *, int);
+
+}  // namespace vlgs

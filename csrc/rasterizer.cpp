@@ -1,0 +1,267 @@
+#include "rasterizer.h"
+
+#include <omp.h>
+
+#include <algorithm>
+#include <atomic>
+#include <stdexcept>
+#include <string>
+
+#include "checks.h"
+
+namespace vlgs {
+namespace {
+
+constexpr int64_t kAhead = 16;  // rows between asking for a cache line out of order and using it
+// Slots are summed whenever this much has been written: small enough to be in cache still.
+constexpr int64_t kSlotBytes = 8 << 20;
+
+// Adds the slots of one tile to the sums of the ranks in a range, of which the tile's list holds one stretch.
+template <class T>
+void add_slots(const Pass<T> &p, int64_t tile, Range ranks, const T *slots, T *sums) {
+  const uint32_t *list = p.ranks + p.tile_begin[tile], *end = p.ranks + p.tile_begin[tile + 1];
+  const uint32_t *at = std::lower_bound(list, end, ranks.begin);
+  for (; at < end && *at < ranks.end; ++at) {
+    if (at + kAhead < end) __builtin_prefetch(sums + at[kAhead] * p.slot_size, 1);
+    T *sum = sums + *at * p.slot_size;
+    const T *slot = slots + (at - list) * p.slot_size;
+    for (int64_t i = 0; i < p.slot_size; ++i) sum[i] += slot[i];
+  }
+}
+
+// Throws for what the tile kernels found.
+template <class T>
+void refuse_upstream(const Pass<T> &p) {
+  const int64_t pixels = p.grid.width * p.grid.height;
+  for (int k = 0; k < p.num_parts; ++k)
+    if (p.parts[k].d_image)
+      check_rows("gradient of images[" + std::to_string(p.parts[k].group) + "] must be finite",
+                 p.parts[k].d_image, pixels, p.parts[k].channels, -kLargest, kLargest);
+  for (int c = 0; c < p.chains; ++c)
+    if (p.d_alphas[c])
+      check_rows("gradient of alphas must be finite", p.d_alphas[c], pixels, 1, -kLargest, kLargest);
+}
+
+}  // namespace
+
+template <class T>
+Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vector<Chain<T>> chains,
+                std::vector<Part<T>> parts, const BlendConfig &config, bool *visible, int threads)
+    : n_(n), grid_(grid), config_(config), chains_(std::move(chains)), parts_(std::move(parts)) {
+  std::vector<const T *> weights;
+  if (n >= kCulled)
+    throw std::invalid_argument("rasterize: n must be below 2^32 - 1, got " + std::to_string(n));
+  for (const Chain<T> &c : chains_) {
+    if (any_outside(c.weight, n, T(0), T(1)))
+      check_rows("groups[" + std::to_string(c.group) + "].weight must be in [0, 1]", c.weight, n, 1, 0, 1);
+    weights.push_back(c.weight);
+  }
+  const int row_threads = worth(n, threads);
+  order_ = sort_visible(grid, n, splats, weights, T(config.alpha_min), row_threads);
+  const int num_chains = int(chains_.size());
+  for (int first = 0; first < num_chains; first += kMaxChains) {
+    stages_.push_back(make_stage(first, std::min(kMaxChains, num_chains - first)));
+    fill_records(stages_.back(), splats, row_threads);
+  }
+  lists_ = make_lists(grid, n, order_, stages_[0].records.data(), num_chains, config.memory_budget, visible,
+                      row_threads);
+  for (Stage &s : stages_) render(s, worth(lists_.begin.back() + grid.tiles_x * grid.tiles_y, threads));
+}
+
+template <class T>
+typename Blend<T>::Stage Blend<T>::make_stage(int first_chain, int num_chains) const {
+  Stage s{};
+  s.first_chain = first_chain;
+  Pass<T> &p = s.pass;
+  p.grid = grid_;
+  p.alpha_max = T(config_.alpha_max), p.transmittance_min = T(config_.transmittance_min);
+  p.stop_before = config_.stop_before;
+  p.chains = num_chains;
+  for (int c = 0; c < num_chains; ++c) {
+    p.shape_grad[c] = chains_[first_chain + c].shape_grad;
+    p.alphas[c] = chains_[first_chain + c].alpha;
+  }
+  p.slot_size = kSlotHead;
+  p.narrow = true;
+  for (size_t i = 0; i < parts_.size(); ++i) {
+    Part<T> part = parts_[i];
+    part.chain -= first_chain;
+    if (part.chain < 0 || part.chain >= num_chains) continue;
+    if (s.parts.empty()) s.first_part = int(i);
+    p.narrow = p.narrow && part.channels == 3 && part.chain == int(s.parts.size());
+    part.padded = (part.channels + 3) / 4 * 4;
+    part.slot = p.slot_size;
+    p.slot_size += part.padded;
+    p.channels += part.channels;
+    p.padded_channels += part.padded;
+    s.parts.push_back(part);
+  }
+  p.narrow = p.narrow && int(s.parts.size()) == num_chains;
+  if (p.narrow) p.slot_size = kRecord;
+  p.parts = s.parts.data();
+  p.num_parts = int(s.parts.size());
+  p.ids = order_.ids.data();
+  return s;
+}
+
+// In the order of the rows: one record is written out of order instead of seven arrays being read so.
+template <class T>
+void Blend<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) const {
+  Pass<T> &p = s.pass;
+  s.records = Buffer<T>(order_.count * kRecord);
+  p.records = s.records.data();
+  std::atomic<bool> bad = false;
+#pragma omp parallel for num_threads(threads)
+  for (int64_t i = 0; i < n_; ++i) {
+    if (const uint32_t next = order_.rank_of[std::min(i + kAhead, n_ - 1)]; next != kCulled)
+      __builtin_prefetch(p.records + next * int64_t(kRecord), 1);
+    if (order_.rank_of[i] == kCulled) continue;
+    T *g = s.records.data() + order_.rank_of[i] * int64_t(kRecord);
+    const T *mean = splats.mean2d + 2 * i, *ellipse = splats.ellipse + 3 * i;
+    g[kMeanX] = mean[0], g[kMeanY] = mean[1];
+    g[kInvSigmaX] = ellipse[0] * T(kOctaves), g[kSlope] = ellipse[1],
+    g[kInvSigmaY] = ellipse[2] * T(kOctaves);
+    for (int c = 0; c < p.chains; ++c) {
+      g[kChains0 + 2 * c + kWeight] = chains_[s.first_chain + c].weight[i];
+      g[kChains0 + 2 * c + kCutoff] = order_.cutoffs[(s.first_chain + c) * n_ + i];
+    }
+    for (const Part<T> &part : s.parts) {
+      const T *values = part.values + i * part.channels;
+      if (any_not_finite(values, part.channels)) bad = true;
+      if (p.narrow) std::copy(values, values + 3, g + kValues + 3 * part.chain);
+    }
+  }
+  if (!bad) return;
+  for (const Part<T> &part : s.parts)
+    check_rows("groups[" + std::to_string(part.group) + "].values must be finite", part.values, n_,
+               part.channels, -kLargest, kLargest);
+}
+
+template <class T>
+void Blend<T>::render(Stage &s, int threads) const {
+  Pass<T> &p = s.pass;
+  p.tile_begin = lists_.begin.data(), p.ranks = lists_.ranks.data(), p.masks = lists_.masks.data();
+  const int64_t tiles = grid_.tiles_x * grid_.tiles_y, pixels = tiles * p.chains * kBlocks * kPixels;
+  s.transmittance = Buffer<T>(pixels);
+  s.last = Buffer<T>(pixels);
+  p.transmittance = s.transmittance.data(), p.last = s.last.data();
+  const Kernels<T> &kernel = kernels<T>();
+  const int64_t size = kernel.blend_scratch(p, lists_.longest), list_size = lists_.longest + 1;
+  const Buffer<T> scratch(threads * size);
+  const Buffer<uint32_t> list(threads * list_size);
+#pragma omp parallel for num_threads(threads) schedule(dynamic)
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    const int t = omp_get_thread_num();
+    kernel.blend(p, tile, scratch.data() + t * size, list.data() + t * list_size);
+  }
+}
+
+// Sum of the slots of every rank, in the order of the tiles whatever the threads: [m, slot_size].
+template <class T>
+Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, int threads) const {
+  const int64_t tiles = p.grid.tiles_x * p.grid.tiles_y, m = order_.count, size = p.slot_size;
+  const int64_t entries_at_once = std::max<int64_t>(1, kSlotBytes / (size * int64_t(sizeof(T))));
+  std::vector<int64_t> strips = {0};  // first tile of each
+  int64_t most = 0;
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    if (p.tile_begin[tile + 1] - p.tile_begin[strips.back()] > entries_at_once && tile > strips.back())
+      strips.push_back(tile);
+    most = std::max(most, p.tile_begin[tile + 1] - p.tile_begin[strips.back()]);
+  }
+  strips.push_back(tiles);
+
+  const Kernels<T> &kernel = kernels<T>();
+  const int64_t scratch_size = kernel.backward_scratch(p, lists_.longest);
+  Buffer<T> sums(m * size), slots(most * size), scratch(threads * scratch_size);
+  std::atomic<bool> bad = false;
+#pragma omp parallel num_threads(threads)
+  {
+#pragma omp for schedule(static)
+    for (int64_t i = 0; i < m * size; ++i) sums[i] = 0;
+    for (size_t s = 0; s + 1 < strips.size(); ++s) {
+      const int64_t base = p.tile_begin[strips[s]];
+#pragma omp for schedule(dynamic)
+      for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile) {
+        T *mine = scratch.data() + omp_get_thread_num() * scratch_size;
+        if (!kernel.blend_backward(p, tile, mine, slots.data() + (p.tile_begin[tile] - base) * size))
+          bad = true;
+      }
+#pragma omp for schedule(static, 1)
+      for (int t = 0; t < threads; ++t) {
+        const Range ranks = share(m, t, threads);
+        for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile)
+          add_slots(p, tile, ranks, slots.data() + (p.tile_begin[tile] - base) * size, sums.data());
+      }
+    }
+  }
+  if (bad) refuse_upstream(p);
+  return sums;
+}
+
+// From moments to gradients (README.md), and from ranks to rows.
+template <class T>
+void Blend<T>::write_gradients(const Stage &s, const Buffer<T> &sums, const BlendGrads<T> &d,
+                               int threads) const {
+  const Pass<T> &p = s.pass;
+  constexpr T kPerOctave = T(1 / kOctaves), kPerOctave2 = T(1 / (kOctaves * kOctaves));
+  const bool first = s.first_chain == 0;
+  std::atomic<bool> bad = false;
+#pragma omp parallel for num_threads(threads)
+  for (int64_t i = 0; i < n_; ++i) {
+    static constexpr T kNothing[kRecord] = {};
+    const bool seen = order_.rank_of[i] != kCulled;
+    if (const uint32_t next = order_.rank_of[std::min(i + kAhead, n_ - 1)]; next != kCulled) {
+      __builtin_prefetch(sums.data() + next * p.slot_size);
+      __builtin_prefetch(p.records + next * int64_t(kRecord));
+    }
+    T *d_mean = d.d_mean2d + 2 * i, *d_ellipse = d.d_ellipse + 3 * i;
+    if (first) std::fill(d_mean, d_mean + 2, T(0)), std::fill(d_ellipse, d_ellipse + 3, T(0));
+    const T *sum = seen ? sums.data() + order_.rank_of[i] * p.slot_size : kNothing;
+    for (int c = 0; c < p.chains; ++c) d.d_weights[s.first_chain + c][i] = sum[kSlotWeight0 + c];
+    for (int k = 0; k < p.num_parts; ++k) {
+      const Part<T> &part = p.parts[k];
+      T *to = d.d_values[s.first_part + k] + i * part.channels;
+      const T *from = sum + (p.narrow ? kSlotValues + 3 * part.chain : part.slot);
+      seen ? void(std::copy(from, from + part.channels, to)) : std::fill(to, to + part.channels, T(0));
+    }
+    if (!seen) continue;
+    if (any_not_finite(sum, p.slot_size)) bad = true;
+    const T *g = p.records + order_.rank_of[i] * int64_t(kRecord);
+    const T a = g[kInvSigmaX], slope = g[kSlope], b = g[kInvSigmaY];
+    d_mean[0] += kPerOctave2 * a * sum[kMomentU];
+    d_mean[1] += kPerOctave2 * (b * sum[kMomentV] - a * slope * sum[kMomentU]);
+    d_ellipse[0] -= kPerOctave * sum[kMomentUU] / a;
+    d_ellipse[1] += kPerOctave2 * (a / b) * sum[kMomentUV];
+    d_ellipse[2] -= kPerOctave * sum[kMomentVV] / b;
+  }
+  if (!bad) return;
+  for (int c = 0; c < p.chains; ++c)
+    check_rows("gradient of a weight must be finite", d.d_weights[s.first_chain + c], n_, 1, -kLargest,
+               kLargest);
+  for (int k = 0; k < p.num_parts; ++k)
+    check_rows("gradient of groups[" + std::to_string(p.parts[k].group) + "].values must be finite",
+               d.d_values[s.first_part + k], n_, p.parts[k].channels, -kLargest, kLargest);
+  throw std::invalid_argument(
+      "rasterize: gradient of means, quats and scales must be finite, got a number that is not");
+}
+
+template <class T>
+void Blend<T>::backward(const BlendGrads<T> &d, int threads) const {
+  const int tile_threads = worth(lists_.begin.back() + grid_.tiles_x * grid_.tiles_y, threads);
+  for (const Stage &s : stages_) {
+    Pass<T> p = s.pass;
+    std::vector<Part<T>> parts = s.parts;
+    for (int k = 0; k < p.num_parts; ++k) {
+      parts[k].values = d.values[s.first_part + k];
+      parts[k].d_image = d.d_images[s.first_part + k];
+    }
+    p.parts = parts.data();
+    for (int c = 0; c < p.chains; ++c) p.d_alphas[c] = d.d_alphas[s.first_chain + c];
+    write_gradients(s, sum_slots(p, tile_threads), d, worth(n_, threads));
+  }
+}
+
+template class Blend<float>;
+template class Blend<double>;
+
+}  // namespace vlgs

@@ -1,0 +1,75 @@
+// The operations the bindings offer: threads and memory around the kernels.
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "lists.h"
+
+namespace vlgs {
+
+// Both throw std::invalid_argument naming the first number that is not finite.
+template <class T>
+void project(const Camera &, int64_t n, const Gaussians<T> &, const Splats<T> &, int threads);
+template <class T>
+void project_backward(const Camera &, int64_t n, const Gaussians<T> &, const GaussianGrads<T> &, int threads);
+
+struct BlendConfig {
+  double alpha_min, alpha_max, transmittance_min;
+  bool stop_before;
+  int64_t memory_budget;  // bytes
+};
+
+template <class T>
+struct Chain {
+  const T *weight;  // [n]
+  bool shape_grad;
+  T *alpha;   // [height, width]
+  int group;  // for messages
+};
+
+template <class T>
+struct BlendGrads {
+  std::vector<const T *> values;    // [n, channels] per part, as they were
+  std::vector<const T *> d_images;  // per part; null where unused
+  std::vector<const T *> d_alphas;  // per chain; null where unused
+  T *d_mean2d, *d_ellipse;          // [n, 2], [n, 3]
+  std::vector<T *> d_weights;       // [n] per chain
+  std::vector<T *> d_values;        // [n, channels] per part
+};
+
+// One picture: blends on construction and keeps the lists for its gradients.
+template <class T>
+class Blend {
+ public:
+  // `parts` are in the order of their chains.
+  Blend(const Grid &, int64_t n, const Splats<T> &, std::vector<Chain<T>>, std::vector<Part<T>> parts,
+        const BlendConfig &, bool *visible, int threads);
+
+  void backward(const BlendGrads<T> &, int threads) const;
+
+ private:
+  // Chains [first_chain, first_chain + pass.chains) and their parts.
+  struct Stage {
+    Pass<T> pass;
+    std::vector<Part<T>> parts;
+    int first_chain, first_part;
+    Buffer<T> records, transmittance, last;
+  };
+  Stage make_stage(int first_chain, int num_chains) const;
+  void fill_records(Stage &, const Splats<T> &, int threads) const;
+  void render(Stage &, int threads) const;
+  Buffer<T> sum_slots(const Pass<T> &, int threads) const;
+  void write_gradients(const Stage &, const Buffer<T> &sums, const BlendGrads<T> &, int threads) const;
+
+  int64_t n_;
+  Grid grid_;
+  BlendConfig config_;
+  std::vector<Chain<T>> chains_;
+  std::vector<Part<T>> parts_;
+  DepthOrder<T> order_;
+  TileLists lists_;
+  std::vector<Stage> stages_;
+};
+
+}  // namespace vlgs

@@ -1,0 +1,122 @@
+"""The kernel against the dense reference: values and every gradient."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from render_hard_scenes import HARD_SCENES
+from render_scenes import (
+    Splats,
+    random_splats,
+    relative_error,
+    render_with_gradients,
+    sure_pixels,
+)
+from torch import Tensor
+
+from vlgs.types import RasterConfig
+
+
+def assert_agree(splats: Splats, config: RasterConfig | None = None) -> None:
+    """Float64: equal up to rounding, whatever the scene."""
+    got, got_grads = render_with_gradients(splats, "cpu", config)
+    want, want_grads = render_with_gradients(splats, "reference", config)
+    for a, b in zip(got.images + got.alphas, want.images + want.alphas, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+    assert torch.equal(got.visible, want.visible)
+    torch.testing.assert_close(got.mean2d, want.mean2d, rtol=1e-12, atol=1e-11)
+    for name, grad in want_grads.items():
+        scale = grad.abs().max().item()
+        torch.testing.assert_close(
+            got_grads[name],
+            grad,
+            rtol=1e-8,
+            atol=1e-10 * max(scale, 1.0),
+            msg=lambda m, n=name: f"{n}: {m}",
+        )
+
+
+@pytest.mark.parametrize("stop", ["after", "before"])
+@pytest.mark.parametrize("first", range(0, 120, 20))
+def test_random_scenes(first: int, stop: str):
+    for seed in range(first, first + 20):
+        splats = random_splats(
+            n=[1, 5, 30, 80][seed % 4], seed=seed, spread=[0.3, 0.8, 1.5][seed % 3]
+        )
+        assert_agree(splats, RasterConfig(stop=stop))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "channels", [(1,), (3,), (16,), (40,), (512,), (3, 16), (1, 2, 3, 4, 5), (7, 512)]
+)
+def test_any_number_of_groups_and_channels(channels: tuple[int, ...]):
+    assert_agree(random_splats(25, seed=len(channels), channels=channels))
+
+
+def test_groups_with_one_weight_tensor():
+    splats = random_splats(30, seed=3, channels=(3, 5, 3))
+    a, b, _ = splats.weights
+    assert_agree(replace(splats, weights=(a, b, a)))
+
+
+@pytest.mark.parametrize("shape_grads", [(True, False), (False, True), (False, False)])
+def test_a_group_may_leave_the_shape_alone(shape_grads: tuple[bool, bool]):
+    splats = replace(random_splats(30, seed=4), shape_grads=shape_grads)
+    assert_agree(splats)
+    assert_agree(replace(splats, weights=splats.weights[:1] * 2))
+
+
+def test_every_constant_is_respected():
+    config = RasterConfig(
+        near=1.0, eps2d=1.7, alpha_min=0.05, alpha_max=0.6, transmittance_min=0.2, fov_margin=0.1
+    )
+    for seed in range(10):
+        assert_agree(random_splats(40, seed), config)
+        assert_agree(random_splats(40, seed), replace(config, stop="before"))
+
+
+@pytest.mark.parametrize("stop", ["after", "before"])
+@pytest.mark.parametrize("scene", HARD_SCENES)
+def test_hard_scenes(scene: Callable[[], Splats], stop: str):
+    assert_agree(scene(), RasterConfig(stop=stop))  # pyright: ignore[reportArgumentType]
+
+
+def test_float32_within_its_promise():
+    """Images within 1e-5, gradients within 1e-3 and 0.99999 in direction, off the cutoffs.
+
+    Measured over these scenes: images 4e-6, gradients 2e-5.
+    """
+    config = RasterConfig()
+    for seed in range(60):
+        splats = random_splats(n=[3, 30, 120][seed % 3], seed=1000 + seed)
+        sure = sure_pixels(splats, config, band=1e-4)
+        want, want_grads = render_with_gradients(splats, "reference", config, sure.double())
+        got, got_grads = render_with_gradients(
+            splats.to(torch.float32), "cpu", config, sure.double()
+        )
+        for a, b in zip(got.images + got.alphas, want.images + want.alphas, strict=True):
+            assert (a.double() - b)[sure].abs().max() < 1e-5
+        for name, grad in want_grads.items():
+            assert relative_error(got_grads[name].double(), grad) < 1e-3, (seed, name)
+            assert cosine(got_grads[name].double(), grad) > 0.99999, (seed, name)
+
+
+def cosine(a: Tensor, b: Tensor) -> float:
+    return (
+        1.0 if not b.any() else float(torch.dot(a.flatten(), b.flatten()) / (a.norm() * b.norm()))
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_contributing_pixel_is_missed(dtype: torch.dtype):
+    """Faint Gaussians hide nothing: one missing (pixel, Gaussian) costs at least 1/255 of accumulated weight."""
+    config = RasterConfig()
+    for seed in range(12):
+        splats = random_splats(200, seed=seed, channels=(1,), spread=1.6)
+        splats = replace(splats, weights=(splats.weights[0] * 0.02 + 0.003,))
+        sure = sure_pixels(splats, config, band=2e-5)
+        want, _ = render_with_gradients(splats, "reference", config)
+        got, _ = render_with_gradients(splats.to(dtype), "cpu", config)
+        assert sure.double().mean() > 0.5
+        assert (got.alphas[0].double() - want.alphas[0])[sure].abs().max() < 2e-5

@@ -1,0 +1,83 @@
+"""The compiled kernel (csrc/bindings.cpp). Arrays are contiguous CPU tensors of one dtype; outputs are written in place."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+def isa() -> str:
+    """The instruction set in use: ``v4`` (AVX-512), ``v3`` (AVX2) or ``base``; lowered by the environment's VLGS_ISA."""
+
+class Camera:
+    def __init__(
+        self,
+        viewmat: Sequence[float],
+        intrinsics: Sequence[float],
+        slopes: Sequence[float],
+        near: float,
+        blur: float,
+    ) -> None: ...
+
+class BlendConfig:
+    def __init__(
+        self,
+        alpha_min: float,
+        alpha_max: float,
+        transmittance_min: float,
+        stop_before: bool,
+        memory_budget: int,
+    ) -> None: ...
+
+def project(
+    camera: Camera,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    mean2d: Tensor,
+    ellipse: Tensor,
+    depth: Tensor,
+    threads: int,
+) -> None: ...
+def project_backward(
+    camera: Camera,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    depth: Tensor,
+    d_mean2d: Tensor,
+    d_ellipse: Tensor,
+    d_means: Tensor,
+    d_quats: Tensor,
+    d_scales: Tensor,
+    threads: int,
+) -> None: ...
+
+class BlendFloat:
+    def __init__(
+        self,
+        mean2d: Tensor,
+        ellipse: Tensor,
+        depth: Tensor,
+        weights: Sequence[Tensor],
+        shape_grads: Sequence[bool],
+        values: Sequence[Tensor],
+        groups: Sequence[int],
+        chain_of: Sequence[int],
+        config: BlendConfig,
+        images: Sequence[Tensor],
+        alphas: Sequence[Tensor],
+        visible: Tensor,
+        threads: int,
+    ) -> None: ...
+    def backward(
+        self,
+        values: Sequence[Tensor],
+        d_images: Sequence[Tensor | None],
+        d_alphas: Sequence[Tensor | None],
+        d_mean2d: Tensor,
+        d_ellipse: Tensor,
+        d_weights: Sequence[Tensor],
+        d_values: Sequence[Tensor],
+        threads: int,
+    ) -> None: ...
+
+class BlendDouble(BlendFloat): ...

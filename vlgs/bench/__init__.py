@@ -1,0 +1,1 @@
+"""Run time against error; `python -m vlgs.bench kernel` times the rasterizer."""

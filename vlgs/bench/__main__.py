@@ -1,0 +1,33 @@
+"""Command line of the benchmarks."""
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+
+from vlgs.bench.kernel import SIZES, measure_kernel, show_table, write_csv
+
+
+def main() -> None:
+    """Time what is asked for and print it."""
+    parser = argparse.ArgumentParser(prog="python -m vlgs.bench", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    kernel = commands.add_parser("kernel", help="forward and backward of the rasterizer")
+    kernel.add_argument("--sizes", type=int, nargs="+", default=range(len(SIZES)), metavar="ROW")
+    kernel.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    kernel.add_argument("--channels", type=int, nargs="+", default=[3], help="of language")
+    kernel.add_argument("--repeats", type=int, default=9)
+    kernel.add_argument(
+        "--out", type=Path, nargs="?", const=Path("results/bench/kernel.csv"), help="write CSV"
+    )
+    args = parser.parse_args()
+    sizes = [SIZES[i] for i in args.sizes]
+    timings = measure_kernel(sizes, args.threads, args.channels, args.repeats)
+    console = Console()
+    console.print(show_table(timings), width=max(console.width, 110))
+    if args.out:
+        write_csv(timings, args.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""The kernel in `csrc` as two autograd functions: projecting, then blending, with `mean2d` between them."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from vlgs import _csrc
+from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
+
+
+class Splats(NamedTuple):
+    """Gaussians on the image plane, as csrc/kernels.h describes them."""
+
+    mean2d: Float[Tensor, "n 2"]
+    """Pixels; 0 where culled."""
+    ellipse: Float[Tensor, "n 3"]
+    """1 / deviation of x given y, slope of x over y, 1 / deviation of y."""
+    depth: Float[Tensor, " n"]
+    """World units; 0 marks a culled Gaussian. Carries no gradient."""
+
+
+def rasterize(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    groups: Sequence[ChannelGroup],
+    camera: Camera,
+    config: RasterConfig,
+) -> Rendered:
+    """`vlgs.rasterize` on checked input."""
+    return blend(project(means, quats, scales, camera, config), groups, camera, config)
+
+
+def project(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    camera: Camera,
+    config: RasterConfig,
+) -> Splats:
+    """The first of the two autograd functions."""
+    return Splats(*_Project.apply(means, quats, scales, _kernel_camera(camera, config)))
+
+
+def blend(
+    splats: Splats, groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
+) -> Rendered:
+    """The second of the two autograd functions."""
+    layout, weights = _lay_out(groups, camera, config)
+    values = [groups[i].values for i in layout.order]
+    visible, *pictures = _Blend.apply(layout, *splats, *weights, *values)
+    images: list[Tensor] = [visible] * len(groups)
+    alphas = list(images)
+    for image, i, chain in zip(
+        pictures[len(weights) :], layout.order, layout.chain_of, strict=True
+    ):
+        images[i], alphas[i] = image, pictures[chain]
+    return Rendered(tuple(images), tuple(alphas), visible, splats.mean2d)
+
+
+class _Layout(NamedTuple):
+    """How groups hang on chains of transmittance, and what does not need a gradient."""
+
+    width: int
+    height: int
+    config: _csrc.BlendConfig
+    shape_grads: list[bool]
+    """Per chain."""
+    order: list[int]
+    """Groups in the order of their chains."""
+    chain_of: list[int]
+    """Chain of each of `order`."""
+
+
+def _lay_out(
+    groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
+) -> tuple[_Layout, list[Tensor]]:
+    """Groups with the very same weight tensor share a chain; returns the weights, one per chain."""
+    chains: dict[tuple[int, bool], int] = {}
+    chain_of = [chains.setdefault((id(g.weight), g.shape_grad), len(chains)) for g in groups]
+    order = sorted(range(len(groups)), key=chain_of.__getitem__)
+    weights = [groups[chain_of.index(c)].weight for c in range(len(chains))]
+    shape_grads = [shape_grad for _, shape_grad in chains]
+    layout = _Layout(
+        camera.width, camera.height, _kernel_config(config),
+        shape_grads, order, [chain_of[i] for i in order],
+    )  # fmt: skip
+    return layout, weights
+
+
+@lru_cache(maxsize=64)
+def _kernel_config(config: RasterConfig) -> _csrc.BlendConfig:
+    return _csrc.BlendConfig(
+        config.alpha_min,
+        config.alpha_max,
+        config.transmittance_min,
+        config.stop == "before",
+        config.memory_budget,
+    )
+
+
+def _kernel_camera(camera: Camera, config: RasterConfig) -> _csrc.Camera:
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    x, y = config.fov_margin * camera.width / 2, config.fov_margin * camera.height / 2
+    slopes = [
+        -(cx + x) / fx, (camera.width - cx + x) / fx,
+        -(cy + y) / fy, (camera.height - cy + y) / fy,
+    ]  # fmt: skip
+    viewmat = camera.viewmat.flatten().tolist()
+    return _csrc.Camera(viewmat, [fx, fy, cx, cy], slopes, config.near, config.eps2d)
+
+
+class _Project(torch.autograd.Function):
+    """Gaussians to the fields of `Splats`."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: _csrc.Camera):
+        means, quats, scales = means.contiguous(), quats.contiguous(), scales.contiguous()
+        mean2d, ellipse = means.new_empty(len(means), 2), means.new_empty(len(means), 3)
+        depth = means.new_empty(len(means))
+        threads = torch.get_num_threads()
+        _csrc.project(camera, means, quats, scales, mean2d, ellipse, depth, threads)
+        ctx.save_for_backward(means, quats, scales, depth)
+        ctx.camera = camera
+        ctx.mark_non_differentiable(depth)
+        return mean2d, ellipse, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        means, quats, scales, depth = ctx.saved_tensors
+        grads = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
+        upstream = grad_outputs[0].contiguous(), grad_outputs[1].contiguous()
+        threads = torch.get_num_threads()
+        _csrc.project_backward(ctx.camera, means, quats, scales, depth, *upstream, *grads, threads)
+        return (*grads, None)
+
+
+class _Blend(torch.autograd.Function):
+    """Splats, one weight per chain and the values of every group to (visible, alpha per chain, image per group)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, layout: _Layout, mean2d: Tensor, ellipse: Tensor, depth: Tensor, *rest: Tensor
+    ):
+        num_chains = len(layout.shape_grads)
+        rest = tuple(t.contiguous() for t in rest)
+        weights, values = rest[:num_chains], rest[num_chains:]
+        size = (layout.height, layout.width)
+        visible = torch.empty(len(depth), dtype=torch.bool)
+        alphas = [depth.new_empty(size) for _ in weights]
+        images = [depth.new_empty(*size, v.shape[1]) for v in values]
+        kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
+        ctx.blend = kernel(
+            mean2d, ellipse, depth, weights, layout.shape_grads, values, layout.order,
+            layout.chain_of, layout.config, images, alphas, visible, torch.get_num_threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(mean2d, ellipse, *rest)
+        ctx.num_chains = num_chains
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(visible)
+        return (visible, *alphas, *images)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        mean2d, ellipse, *rest = ctx.saved_tensors
+        num_chains = ctx.num_chains
+        # None for a picture that the loss did not use; the first output is `visible`.
+        d_pictures = [None if d is None else d.contiguous() for d in grad_outputs[1:]]
+        grads = [torch.empty_like(t) for t in (mean2d, ellipse, *rest)]
+        d_mean2d, d_ellipse, *d_rest = grads
+        ctx.blend.backward(
+            rest[num_chains:], d_pictures[num_chains:], d_pictures[:num_chains], d_mean2d, d_ellipse,
+            d_rest[:num_chains], d_rest[num_chains:], torch.get_num_threads(),
+        )  # fmt: skip
+        return (None, d_mean2d, d_ellipse, None, *d_rest)
