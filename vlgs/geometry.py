@@ -74,9 +74,7 @@ def pose_matrix(
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same camera for an image of another size; each axis is scaled on its own."""
-    scale = torch.tensor(
-        [width / camera.width, height / camera.height, 1.0], dtype=camera.K.dtype
-    )
+    scale = torch.tensor([width / camera.width, height / camera.height, 1.0], dtype=camera.K.dtype)
     return Camera(camera.viewmat, camera.K * scale[:, None], width, height)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from vlgs.bench.kernel import SIZES, measure_kernel, show_table, write_csv
+from vlgs.bench.overhead import measure_overhead
 
 
 def main() -> None:
@@ -20,7 +21,13 @@ def main() -> None:
     kernel.add_argument(
         "--out", type=Path, nargs="?", const=Path("results/bench/kernel.csv"), help="write CSV"
     )
+    overhead = commands.add_parser("overhead", help="what the Trainer adds to an iteration")
+    overhead.add_argument("--iterations", type=int, default=300)
     args = parser.parse_args()
+    if args.command == "overhead":
+        cost = measure_overhead(args.iterations)
+        Console().print(f"step {cost.step:.2f} ms, around it {cost.around:.2f} ms (medians)")
+        return
     sizes = [SIZES[i] for i in args.sizes]
     timings = measure_kernel(sizes, args.threads, args.channels, args.repeats)
     console = Console()
