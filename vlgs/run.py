@@ -2,6 +2,7 @@
 
 import logging
 import os
+import resource
 import sys
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -147,6 +148,7 @@ def _report(
     extra = {
         "n_gaussians": model.count,
         "train_seconds": module.train_seconds,
+        "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         "ply_bytes": folder.ply.stat().st_size,
         "checkpoint_bytes": max(f.stat().st_size for f in folder.checkpoint.glob("*.safetensors")),
         "seed": config.seed,

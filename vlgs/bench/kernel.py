@@ -14,6 +14,7 @@ from rich.table import Table
 from vlgs import _csrc
 from vlgs.bench.workload import Workload, make_workload
 from vlgs.render import cpu, rasterize
+from vlgs.report.provenance import commit, machine
 from vlgs.types import RasterConfig, Rendered
 
 
@@ -132,9 +133,13 @@ def show_table(timings: Sequence[Timing]) -> Table:
 
 
 def write_csv(timings: Sequence[Timing], path: Path) -> None:
-    """One line per timing, columns named as the fields of `Timing`."""
+    """One line per timing, columns named as the fields of `Timing`; comments say which machine and commit."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
+        file.writelines(f"# {key}: {value}\n" for key, value in machine().items())
+        file.write(
+            f"# commit: {commit()}\n# milliseconds, medians; opensplat is its published figure\n"
+        )
         writer = csv.DictWriter(file, [f.name for f in fields(Timing)])
         writer.writeheader()
         writer.writerows(asdict(t) for t in timings)

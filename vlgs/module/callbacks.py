@@ -165,8 +165,7 @@ class ProgressLine(L.Callback):
         )
 
         self.bar = Progress(
-            TextColumn("training"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=12),
             MofNCompleteColumn(),
             TextColumn(
                 "loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]:,} Gaussians"

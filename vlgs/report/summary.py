@@ -23,6 +23,7 @@ _ROWS = (
     ("loc_acc_lerf_ovs_ceiling", "  of exact features", "{:.1%}"),
     ("n_gaussians", "Gaussians", "{:,}"),
     ("train_seconds", "training", "{:.1f} s"),
+    ("peak_rss_bytes", "peak memory", "{:,} B"),
     ("fps_color", "colour render", "{:.1f} /s"),
     ("fps_language", "language render", "{:.1f} /s"),
     ("fps_query", "query", "{:.1f} /s"),
