@@ -1,30 +1,10 @@
-"""What several areas need: a small procedural scene, read once, and the configuration composed as on the command line."""
+"""What several areas need: a small procedural scene, read once, and the folder of real data."""
 
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 
-from vlgs.config import CONF
 from vlgs.types import Scene
-
-TINY = (
-    "data.width=48",
-    "data.height=36",
-    "data.train_views=6",
-    "data.test_views=2",
-    "data.points=400",
-    "codec.training.steps=30",
-    "progress=false",
-)
-"""Overrides under which a run takes a second or two."""
-
-
-def composed(*overrides: str) -> DictConfig:
-    """The configuration of `python -m vlgs.run <overrides>`."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
 
 
 @pytest.fixture(scope="session")

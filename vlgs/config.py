@@ -34,6 +34,24 @@ NOT_PART_OF_A_RUN = frozenset(
 not depend on the folder that its data lies in."""
 
 
+def check_config(config: DictConfig) -> None:
+    """Refuse a configuration of `vlgs.run` that cannot work, before anything is read.
+
+    Raises:
+        ValueError: Names the key, what it must be and what it is.
+    """
+    missing = sorted(OmegaConf.missing_keys(config))
+    if missing:
+        raise ValueError(f"config: {missing[0]} must be given, as {missing[0]}=VALUE; got nothing")
+    for key, least in (("seed", 0), ("threads", 1)):
+        value = config[key]
+        if not isinstance(value, int) or value < least:
+            raise ValueError(f"config: {key} must be an integer of at least {least}, got {value}")
+    if config.on_existing not in ("resume", "refuse"):
+        raise ValueError(f"config: on_existing must be resume or refuse, got {config.on_existing}")
+    check_targets(config)
+
+
 def check_targets(config: DictConfig) -> None:
     """Refuse a configuration that would construct something outside the trusted packages.
 

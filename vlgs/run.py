@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import CONF, check_targets, instantiate, run_id
+from vlgs.config import CONF, check_config, instantiate, run_id
 from vlgs.runs import RunFolder
 
 log = logging.getLogger(__name__)
@@ -42,9 +42,7 @@ def run(config: DictConfig) -> int:
     Returns:
         The exit status: 0 when the results are there.
     """
-    check_targets(config)
-    if config.on_existing not in ("resume", "refuse"):
-        raise ValueError(f"config: on_existing must be resume or refuse, got {config.on_existing}")
+    check_config(config)
     import torch
 
     from vlgs.module.state import RESULTS_VERSION

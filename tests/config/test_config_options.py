@@ -1,8 +1,8 @@
 """Every option of every group composes and constructs: none can rot unseen."""
 
 import pytest
-from conftest import composed
 from omegaconf import OmegaConf
+from tiny_runs import composed
 
 from vlgs.config import CONF, check_targets, instantiate
 

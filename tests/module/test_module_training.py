@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TINY, composed
+from tiny_runs import TINY, composed
 from torch import Tensor
 
 from vlgs.config import instantiate

@@ -60,7 +60,9 @@ def test_the_command_prints_and_writes(
     monkeypatch.setattr(sys, "argv", ["bench", "kernel", *arguments, "--out", str(path)])
     main()
     assert "rasterizer" in capsys.readouterr().out
-    rows = list(csv.DictReader(path.read_text().splitlines()))
+    lines = path.read_text().splitlines()
+    assert any(line.startswith("# cpu:") for line in lines)
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     assert [r["part"] for r in rows] == ["call", "blend"] * 2
     assert all(float(r["forward"]) > 0 for r in rows)
     assert rows[2]["opensplat"] == ""

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import TINY, composed
+from tiny_runs import TINY, composed
 
 from vlgs.report.results import METRICS
 from vlgs.run import run
@@ -169,12 +169,12 @@ def test_ctrl_c_saves_says_how_to_go_on_and_goes_on(tmp_path: Path):
     [
         ("fusion=sel", ["Could not find 'fusion/sel'", "self", "none", "mlp", "cross"]),
         ("fusion.dmi=3", ["dmi", "not in struct"]),
-        ("seed=0.5.5", ["seed"]),
+        ("seed=0.5", ["error: config: seed must be an integer of at least 0, got 0.5"]),
         (
             "fusion._target_=os.system",
             ["error: config: fusion._target_ must name something in vlgs, torch, lightning"],
         ),
-        ("data=colmap", ["data.root"]),
+        ("data=colmap", ["error: config: data.root must be given"]),
         ("data=colmap data.root=/nowhere/at/all", ["error:", "/nowhere/at/all", "sparse"]),
         (
             "on_existing=overwrite",

@@ -1,0 +1,23 @@
+"""Runs that take a second or two, as on the command line."""
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from vlgs.config import CONF
+
+TINY = (
+    "data.width=48",
+    "data.height=36",
+    "data.train_views=6",
+    "data.test_views=2",
+    "data.points=400",
+    "codec.training.steps=30",
+    "progress=false",
+)
+"""Overrides under which a run takes a second or two."""
+
+
+def composed(*overrides: str) -> DictConfig:
+    """The configuration of `python -m vlgs.run <overrides>`."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
