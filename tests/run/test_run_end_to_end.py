@@ -220,6 +220,8 @@ def test_help_is_a_manual_and_needs_no_torch():
 
 
 def test_a_multirun_makes_one_run_per_combination(tmp_path: Path):
+    empty = tmp_path / "elsewhere"
+    empty.mkdir()
     done = subprocess.run(
         command(
             "-m",
@@ -231,9 +233,11 @@ def test_a_multirun_makes_one_run_per_combination(tmp_path: Path):
         ),
         capture_output=True,
         text=True,
+        cwd=empty,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
     folders = [RunFolder(path) for path in (tmp_path / "runs").iterdir()]
     assert len(folders) == 2
     assert all(folder.finished() for folder in folders)
+    assert not list(empty.iterdir()), "a sweep must leave nothing where it was started"
