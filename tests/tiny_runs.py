@@ -12,6 +12,7 @@ TINY = (
     "data.test_views=2",
     "data.points=400",
     "codec.training.steps=30",
+    "codec.cache_dir=null",
     "progress=false",
 )
 """Overrides under which a run takes a second or two."""

@@ -199,17 +199,6 @@ class Losses:
         """Second term of Eq. raster; `valid` are the pixels that have a language code."""
         return _LANGUAGE[self.lang_loss](feature, target, valid, self.lang_pixels)
 
-    def raster_loss(
-        self,
-        color: Float[Tensor, "h w 3"],
-        image: Float[Tensor, "h w 3"],
-        feature: Float[Tensor, "h w d"],
-        target: Float[Tensor, "h w d"],
-        valid: Bool[Tensor, "h w"] | None = None,
-    ) -> Float[Tensor, ""]:
-        """L_raster of one view whose photograph covers every pixel (Eq. raster)."""
-        return self.color_loss(color, image) + self.language_loss(feature, target, valid)
-
     def blended_loss(
         self,
         feature: Float[Tensor, "h w d"],

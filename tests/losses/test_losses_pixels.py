@@ -110,7 +110,8 @@ def test_weights_of_the_overall_loss():
     feature, target = torch.full((2, 2, 1), 3.0), torch.ones(2, 2, 1)
     valid = torch.tensor([[True, False], [False, False]])
     losses = Losses()
-    assert losses.raster_loss(color, image, feature, target, valid).item() == 0.25 + 4
+    assert losses.color_loss(color, image).item() == 0.25
+    assert losses.language_loss(feature, target, valid).item() == 4
     assert losses.blended_loss(feature, target, valid, 0.5).item() == pytest.approx(1.2 * 0.5 * 4)
     everywhere = Losses(lang_pixels="all", blend_weight=2.0)
     assert everywhere.blended_loss(feature, target, valid, 1.0).item() == 2.0

@@ -130,7 +130,7 @@ def test_a_word_that_the_vocabulary_lacks_ends_the_run_before_training(tmp_path:
     assert not only_run(tmp_path).checkpoint.exists()
 
 
-def test_ctrl_c_saves_says_how_to_go_on_and_goes_on(tmp_path: Path):
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path):
     overrides = (
         *TINY,
         "trainer=smoke",
