@@ -21,6 +21,9 @@ log = logging.getLogger(__name__)
 STOPPED = 130
 """Exit status after Ctrl-C, as shells have it."""
 
+UNSCORED = 3
+"""Exit status of a run whose scores were asked for and could not be computed: the run is there, its scores are null."""
+
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
@@ -40,7 +43,7 @@ def run(config: DictConfig) -> int:
     """Do one run or take up one that was left; see `main`.
 
     Returns:
-        The exit status: 0 when the results are there.
+        The exit status: 0 when the results are there, else `STOPPED` or `UNSCORED`.
     """
     check_config(config)
     import torch
@@ -61,13 +64,10 @@ def run(config: DictConfig) -> int:
 
 
 def _run_in(folder: RunFolder, config: DictConfig, scene: Any) -> int:
-    from vlgs.report.summary import print_summary
-
     finished = folder.finished()
     if finished is not None:
         log.info("this run exists: %s (nothing was computed)", folder.path)
-        print_summary(finished, _places(folder))
-        return 0
+        return _say(finished, folder)
     text = _text_encoder(config, scene)
     folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
     module, stopped_by = _train(folder, config, scene)
@@ -80,8 +80,15 @@ def _run_in(folder: RunFolder, config: DictConfig, scene: Any) -> int:
             _command(),
         )
         return STOPPED
-    print_summary(_report(folder, config, scene, module, text), _places(folder))
-    return 0
+    return _say(_report(folder, config, scene, module, text), folder)
+
+
+def _say(metrics: dict[str, Any], folder: RunFolder) -> int:
+    """Print a result; the exit status says whether it has the scores that were asked for."""
+    from vlgs.report.summary import print_summary
+
+    print_summary(metrics, _places(folder))
+    return UNSCORED if metrics.get("failure") else 0
 
 
 def _text_encoder(config: DictConfig, scene: Any) -> Any:
@@ -133,7 +140,7 @@ def _report(
     from vlgs.report.evaluate import evaluate, prompts_of
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
-    from vlgs.report.results import write_metrics
+    from vlgs.report.results import write_metrics, write_queries
     from vlgs.report.timing import measure_fps
 
     model, query, protocol = module.model, instantiate(config.query), instantiate(config.protocol)
@@ -155,6 +162,7 @@ def _report(
         "machine": machine(),
         **asdict(timing),
     }
+    write_queries(folder.queries, evaluation)
     return write_metrics(folder.metrics, evaluation, extra)
 
 

@@ -1,6 +1,6 @@
 """Run folders: where the files of a run lie, and who may write them. Imports no torch.
 
-    <results>/runs/<run id>/  config.yaml  metrics.json  log.csv  checkpoint/  renders/  point_cloud.ply
+    <results>/runs/<run id>/  config.yaml  metrics.json  queries.json  log.csv  checkpoint/  renders/  point_cloud.ply
 
 `metrics.json` is written last: a folder that has it is a finished run.
 """
@@ -30,6 +30,11 @@ class RunFolder:
     def metrics(self) -> Path:
         """Results; its presence says that the run is finished."""
         return self.path / "metrics.json"
+
+    @property
+    def queries(self) -> Path:
+        """The score of every query: one row per protocol, view and category."""
+        return self.path / "queries.json"
 
     @property
     def curves(self) -> Path:

@@ -11,18 +11,18 @@ def test_the_window_keeps_its_share_of_the_width():
     relevancy[100:106, 100:106] = 0.5
     mask = torch.zeros(150, 200, dtype=torch.bool)
     mask[98:108, 98:108] = True
-    assert localise(relevancy, mask)
-    assert not localise(relevancy, ~mask)
+    assert localise([relevancy], mask)
+    assert not localise([relevancy], ~mask)
 
 
 def test_a_tiny_image_is_not_smoothed():
     relevancy = torch.zeros(12, 16)
     relevancy[3, 5] = 1.0
     mask = relevancy > 0
-    assert localise(relevancy, mask)
-    assert not localise(relevancy, ~mask)
+    assert localise([relevancy], mask)
+    assert not localise([relevancy], ~mask)
 
 
 def test_a_constant_map_is_no_hit():
     everywhere = torch.ones(12, 16, dtype=torch.bool)
-    assert not localise(torch.full((12, 16), 0.3), everywhere)
+    assert not localise([torch.full((12, 16), 0.3)], everywhere)

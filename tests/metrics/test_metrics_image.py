@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from torchmetrics.functional.image import (
     peak_signal_noise_ratio,
     structural_similarity_index_measure,
@@ -30,10 +32,39 @@ def test_both_agree_with_torchmetrics():
     assert psnr(image, truth) == pytest.approx(
         peak_signal_noise_ratio(image, truth, data_range=1.0).item(), abs=1e-4
     )
-    batch = [x.permute(2, 0, 1)[None] for x in (image, truth)]
+    batch = [x.double().permute(2, 0, 1)[None] for x in (image, truth)]
     want = structural_similarity_index_measure(batch[0], batch[1], data_range=1.0)
     assert isinstance(want, torch.Tensor)
-    assert ssim(image, truth) == pytest.approx(want.item(), abs=2e-3)  # it leaves the border out
+    assert ssim(image, truth) == pytest.approx(want.item(), abs=1e-9)
+
+
+def test_zero_padded_ssim_agrees_with_scipy():
+    image, truth = (x.double().numpy() for x in pair())
+    window = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
+    window /= window.sum()
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        for axis in (0, 1):
+            x = ndimage.correlate1d(x, window, axis=axis, mode="constant")
+        return x
+
+    ma, mb = mean(image), mean(truth)
+    va, vb, ab = mean(image**2) - ma**2, mean(truth**2) - mb**2, mean(image * truth) - ma * mb
+    want = ((2 * ma * mb + 1e-4) * (2 * ab + 9e-4)) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+    got = ssim(*pair(), border="zero")
+    assert got == pytest.approx(want.mean(), abs=1e-9)
+    assert ssim(*pair()) != pytest.approx(got, abs=1e-5)
+
+
+def test_borders_by_hand():
+    # Ones against a half: in the middle 2ab/(a^2+b^2) = 0.8 and no variance; the zero border adds variance of equal shape.
+    ones, half = torch.ones(21, 21, 3), torch.full((21, 21, 3), 0.5)
+    flat = (2 * 0.5 + 1e-4) / (1 + 0.25 + 1e-4)
+    assert ssim(ones, half) == pytest.approx(flat, abs=1e-9)
+    middle = torch.zeros(21, 21, dtype=torch.bool)
+    middle[5:-5, 5:-5] = True
+    assert ssim(ones, half, middle, border="zero") == pytest.approx(flat, abs=1e-9)
+    assert ssim(ones, half, border="zero") != pytest.approx(flat, abs=1e-3)
 
 
 def test_only_valid_pixels_count():

@@ -7,19 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from vlgs.metrics.lerf_ovs import (
-    LANGSPLAT,
-    Constants,
-    Unit,
-    UnitScore,
-    box_mean,
-    intersection_over_union,
-    localise,
-    majority_vote,
-    scene_score,
-    score_unit,
-    segment,
-)
+from vlgs.metrics.lerf_ovs import LerfOvs, localise, score_unit
+from vlgs.metrics.masks import QueryScore, Unit, intersection_over_union
+from vlgs.metrics.protocol import Evidence, Figures, query_figures
+from vlgs.metrics.segment import LANGSPLAT, LANGSPLAT_V2, Constants, segment
+from vlgs.metrics.smooth import box_mean, erode, majority_vote, pool_mean, pool_vote
 
 
 def square(h: int, w: int, top: int, left: int, size: int) -> torch.Tensor:
@@ -157,16 +149,17 @@ def test_truth_as_relevancy_scores_high_and_hits():
     assert score.iou is not None
     assert score.iou > 0.95  # smoothing and voting round the corners off
     assert score.hit
-    assert score.hit_strict
+    assert score_unit(mask.double()[None], unit, strict=True).hit
 
 
 def test_noise_scores_at_chance():
     rng = torch.Generator().manual_seed(0)
     mask = square(120, 120, 0, 0, 60)  # a quarter of the map
     scores = [
-        score_unit(torch.rand(1, 120, 120, generator=rng), Unit("x", mask)) for _ in range(60)
+        score_unit(torch.rand(1, 120, 120, generator=rng), Unit("x", mask), strict=True)
+        for _ in range(60)
     ]
-    result = scene_score(scores, strict=True)
+    result = query_figures(scores)
     assert result.miou is not None
     assert result.miou < 0.25
     assert result.loc_acc == pytest.approx(0.25, abs=0.17)  # three standard deviations of 60 draws
@@ -174,8 +167,11 @@ def test_noise_scores_at_chance():
 
 def test_constant_map_hits_as_released_but_not_strictly():
     unit = Unit("x", square(50, 50, 0, 0, 5), torch.tensor([[0.0, 0.0, 4.0, 4.0]]))
-    score = score_unit(torch.full((1, 50, 50), 0.3), unit)
-    assert score == UnitScore("x", 0.0, True, False)
+    relevancy = torch.full((1, 50, 50), 0.3)
+    released = score_unit(relevancy, unit)
+    assert (released.iou, released.hit) == (0.0, True)
+    strict = score_unit(relevancy, unit, strict=True)
+    assert (strict.iou, strict.hit) == (0.0, False)
 
 
 def test_strict_looks_at_the_first_maximum_only():
@@ -229,24 +225,30 @@ def test_level_is_the_one_with_the_largest_smoothed_value():
     assert score.hit
 
 
-def test_scene_means_are_over_units_and_say_what_is_missing():
+def scored(category: str, both: int, true: int, hit: bool | None = None) -> QueryScore:
+    """A query that selects nothing wrong: its IoU is both / true."""
+    return QueryScore("view", category, both=both, selected=both, true=true, pixels=100, hit=hit)
+
+
+def test_scene_means_are_over_queries_and_say_what_is_missing():
     scores = [
-        UnitScore("a", 0.2, True, True),
-        UnitScore("a", 0.4, False, False),
-        UnitScore("b", 0.9, True, False),
-        UnitScore("c", None, None, None),
+        scored("a", 2, 10, True),
+        scored("a", 4, 10, False),
+        scored("b", 9, 10, True),
+        scored("c", 0, 0),
     ]
-    result = scene_score(scores)
+    result = query_figures(scores)
     assert result.miou == pytest.approx(0.5)
-    assert (result.hits, result.located, result.units) == (2, 3, 4)
+    assert (result.more["hits"], result.more["units"]) == (2, 3)
     assert result.loc_acc == pytest.approx(2 / 3)
     assert result.per_category == {"a": pytest.approx(0.3), "b": 0.9, "c": None}
-    assert scene_score(scores, strict=True).hits == 1
+    assert result.reasons == {"labels": "empty masks were left out: c in view"}
 
 
-def test_no_units_score_nothing():
-    result = scene_score([])
-    assert (result.miou, result.loc_acc, result.units) == (None, None, 0)
+def test_no_queries_score_nothing():
+    result = query_figures([])
+    assert (result.miou, result.loc_acc, result.more["boundary_iou"]) == (None, None, None)
+    assert result.reasons["miou"] == "no held-out view has a labelled object"
 
 
 def test_iou_of_empty_sets():
@@ -257,10 +259,12 @@ def test_iou_of_empty_sets():
     assert intersection_over_union(full, full) == 1
 
 
-@pytest.mark.parametrize("shape", [(0, 5, 5), (1, 5, 6)])
-def test_wrong_sizes_are_refused(shape: tuple[int, ...]):
-    with pytest.raises(ValueError, match="relevancy of 'x' must be"):
-        score_unit(torch.zeros(shape), Unit("x", square(5, 5, 0, 0, 2)))
+def test_no_level_and_wrong_sizes_are_refused():
+    unit = Unit("x", square(5, 5, 0, 0, 2))
+    with pytest.raises(ValueError, match="at one level or more, got none"):
+        score_unit(torch.zeros(0, 5, 5), unit)
+    with pytest.raises(ValueError, match=r"must be \[5, 5\] like its mask, got \[5, 6\]"):
+        score_unit(torch.zeros(1, 5, 6), unit)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -271,5 +275,120 @@ def test_non_finite_relevancy_is_refused(bad: float):
         score_unit(relevancy, Unit("x", square(5, 5, 0, 0, 2)))
 
 
-def test_constants_are_langsplats():
-    assert Constants(30, 0.5, 0.4, 7) == LANGSPLAT
+def test_constants_are_the_published_ones():
+    assert Constants("filter2d", 30, 0.5, True, 0.4, 7, "clipped") == LANGSPLAT
+    assert Constants("pool", 29, 0.5, True, 0.4, 7, "full") == LANGSPLAT_V2
+
+
+@pytest.mark.parametrize(
+    ("row", "size", "want"),
+    [
+        # OpenCV: anchor size // 2, border 101. Even windows reach one further to the left.
+        ([1, 2, 3, 4, 5], 4, [2, 2, 2.5, 3.5, 4]),
+        ([1, 2, 3, 4, 5], 2, [1.5, 1.5, 2.5, 3.5, 4.5]),
+        ([1, 2, 3, 4, 5], 3, [5 / 3, 2, 3, 4, 13 / 3]),
+        ([6, 0, 0, 0, 0, 0], 6, [1, 1, 1, 1, 0, 0]),
+    ],
+)
+def test_box_mean_is_filter2d_by_hand(row: list[float], size: int, want: list[float]):
+    along_x = torch.tensor([[row]], dtype=torch.float64).expand(1, 3, -1)
+    torch.testing.assert_close(box_mean(along_x, size)[0, 1], torch.tensor(want).double())
+    along_y = box_mean(along_x.mT.contiguous(), size)[0, :, 1]
+    torch.testing.assert_close(along_y, torch.tensor(want).double())
+
+
+def test_pool_mean_counts_no_cell_outside_by_hand():
+    row = torch.tensor([[[1.0, 2, 3, 4, 5]]])
+    assert pool_mean(row, 3)[0, 0].tolist() == [1.5, 2, 3, 4, 4.5]
+
+
+def test_pool_mean_agrees_with_torch():
+    rng = torch.Generator().manual_seed(0)
+    maps = torch.rand(2, 33, 40, generator=rng, dtype=torch.float64)
+    want = torch.nn.functional.avg_pool2d(maps, 7, 1, 3, count_include_pad=False)
+    torch.testing.assert_close(pool_mean(maps, 7), want, atol=1e-12, rtol=0)
+
+
+def test_pool_vote_lets_the_last_row_vote():
+    mask = torch.zeros(10, 10, dtype=torch.bool)
+    mask[6:] = True
+    assert pool_vote(mask, 7)[-1].all()
+    assert not pool_vote(mask, 7)[5].any()  # rows 2..8: three of seven
+    assert pool_vote(mask, 7)[6].all()  # rows 3..9: four of seven
+
+
+@settings(max_examples=30, deadline=None)
+@given(h=st.integers(1, 12), w=st.integers(1, 12), d=st.integers(1, 3), seed=st.integers(0, 99))
+def test_erosion_agrees_with_scipy(h: int, w: int, d: int, seed: int):
+    mask = np.random.default_rng(seed).random((h, w)) > 0.2
+    want = ndimage.binary_erosion(mask, np.ones((2 * d + 1, 2 * d + 1)))
+    assert np.array_equal(erode(torch.from_numpy(mask), d).numpy(), want)
+
+
+def test_without_the_stretch_the_threshold_is_that_of_the_normalised_map():
+    ramp = torch.linspace(0, 1, 101).expand(101, 101).double()
+    got = segment(ramp, Constants(vote=1, stretch=False))
+    assert torch.equal(got[50, :-1], torch.arange(100) > 40)
+
+
+@pytest.mark.parametrize("bad", [{"box": 0}, {"window": "pool"}, {"vote": 4}, {"threshold": 1.0}])
+def test_bad_constants_are_refused(bad: dict[str, object]):
+    with pytest.raises(ValueError, match=r"^protocol: "):
+        Constants(**bad)  # type: ignore[arg-type]
+
+
+def evidence(relevancy: torch.Tensor, *units: Unit) -> Evidence:
+    """One class per unit, levels first."""
+    names = tuple(unit.category for unit in units)
+    return Evidence("v", names, units, None, list(relevancy), list(relevancy))
+
+
+def strict_and_released(seen: Evidence) -> tuple[Figures, Figures]:
+    protocols = LerfOvs(strict=True), LerfOvs()
+    strict, released = (p.conclude(p.score(seen), seen.classes) for p in protocols)
+    return strict, released
+
+
+def test_three_levels_are_chosen_per_query():
+    wide, narrow = square(100, 100, 10, 10, 40), square(100, 100, 55, 55, 40)
+    levels = torch.zeros(3, 2, 100, 100)
+    levels[0, 0], levels[2, 0] = 0.5 * narrow, 0.9 * wide
+    levels[0, 1], levels[1, 1] = 0.3 * wide, 0.8 * narrow
+    seen = evidence(levels, Unit("wide", wide), Unit("narrow", narrow))
+    scores = LerfOvs().score(seen)
+    assert [score.level for score in scores] == [2, 1]
+    assert all(score.hit and score.iou is not None and score.iou > 0.85 for score in scores)
+    alone = LerfOvs().score(evidence(levels[:1], Unit("wide", wide), Unit("narrow", narrow)))
+    assert [(score.level, score.hit) for score in alone] == [(None, False), (None, False)]
+
+
+def test_strict_is_lerf_ovs_but_for_localisation():
+    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(60.0), indexing="ij")
+    ramp, flat = (x + y)[None, None] / 120, torch.full((1, 1, 60, 60), 0.5)
+    unit = Unit("x", square(60, 60, 40, 40, 18))
+    for maps, hits in ((ramp, (False, False)), (flat, (False, True))):
+        strict, released = strict_and_released(evidence(maps, unit))
+        assert (strict.loc_acc, released.loc_acc) == tuple(map(float, hits))
+        assert strict.miou == released.miou
+        assert strict.per_category == released.per_category
+    assert (LerfOvs(strict=True).name, LerfOvs().name) == ("lerf_ovs_strict", "lerf_ovs")
+
+
+def test_truth_as_prediction_scores_one_without_the_smoothing():
+    mask = square(90, 90, 20, 30, 25)
+    plain = Constants(box=1, vote=1)
+    figures = LerfOvs(plain).conclude(
+        LerfOvs(plain).score(evidence(mask.float()[None, None], Unit("x", mask))), ("x",)
+    )
+    assert (figures.miou, figures.loc_acc, figures.more["boundary_iou"]) == (1, 1, 1)
+
+
+def test_noise_without_the_smoothing_scores_the_chance_of_its_threshold():
+    # Uniform noise selects p = 0.3 of the map whatever the truth, a share q: IoU = pq / (p + q - pq).
+    rng = torch.Generator().manual_seed(0)
+    mask = square(200, 200, 0, 0, 100)
+    score = score_unit(
+        torch.rand(1, 200, 200, generator=rng), Unit("x", mask), Constants(box=1, vote=1)
+    )
+    p, q = 0.3, 0.25
+    assert score.iou == pytest.approx(p * q / (p + q - p * q), abs=0.01)

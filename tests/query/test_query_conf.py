@@ -6,7 +6,6 @@ import hydra
 import pytest
 from omegaconf import OmegaConf
 
-from vlgs.metrics.protocol import EvaluationProtocol
 from vlgs.query import LerfRelevancy, VocabSoftmax
 from vlgs.query.text import ClipText, VocabularyText
 
@@ -18,9 +17,6 @@ CONF = Path(__file__).parents[2] / "conf"
     [
         ("query/lerf_relevancy", LerfRelevancy()),
         ("query/vocab_softmax", VocabSoftmax()),
-        ("protocol/auto", EvaluationProtocol()),
-        ("protocol/dense", EvaluationProtocol("dense")),
-        ("protocol/lerf_ovs", EvaluationProtocol("lerf_ovs")),
     ],
 )
 def test_option_equals_the_default(option: str, want: object):

@@ -143,6 +143,11 @@ class FakeFused:
     gaussians: Gaussians
     language_weight: Tensor
 
+    @property
+    def feature(self) -> Tensor:
+        """Codes of the Gaussians; nothing is fused."""
+        return self.gaussians.features
+
 
 @dataclass(frozen=True)
 class FakeRender:

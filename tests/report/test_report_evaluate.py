@@ -6,18 +6,25 @@ import pytest
 import torch
 from report_fakes import CLASSES, Drawing, FakeModel, scene, view, vocabulary, with_test
 
-from vlgs.metrics.protocol import EvaluationProtocol
+from vlgs.metrics.dense import Dense
+from vlgs.metrics.goi import Goi
+from vlgs.metrics.lerf_ovs import LerfOvs
+from vlgs.metrics.ovs3d import Ovs3dArgmax, Ovs3dThreshold
+from vlgs.metrics.protocol import Auto, EvaluationProtocol
+from vlgs.metrics.select3d import Select3d
 from vlgs.query import LerfRelevancy, VocabSoftmax
 from vlgs.query.text import VocabularyText
 from vlgs.report.evaluate import Evaluation, evaluate, prompts_of
 from vlgs.report.language import LanguageTally
 from vlgs.types import IGNORE_ID, DenseLabels, ObjectLabels, Scene
 
-AUTO = EvaluationProtocol()
+AUTO = Auto()
 OBJECTS = CLASSES[2:5]
 
 
-def score(scene: Scene, noise: float = 0.0, protocol: EvaluationProtocol = AUTO) -> Evaluation:
+def score(
+    scene: Scene, noise: float = 0.0, protocol: EvaluationProtocol | Auto = AUTO
+) -> Evaluation:
     return evaluate(
         FakeModel(noise), scene, LerfRelevancy(), VocabularyText(scene.vocabulary), protocol
     )
@@ -25,14 +32,14 @@ def score(scene: Scene, noise: float = 0.0, protocol: EvaluationProtocol = AUTO)
 
 def test_the_truth_scores_one():
     got = score(scene())
-    assert got.protocol == "dense@1 split=synthetic"
+    assert got.protocol == "dense@1/synthetic"
     assert got.miou == 1
     assert got.loc_acc == 1
     assert got.per_category == dict.fromkeys(CLASSES[:5], 1.0) | {"absent": None}
     assert got.beside["pixel_accuracy"] == 1
     assert got.ssim == pytest.approx(1)
     assert got.psnr == torch.inf
-    assert got.reasons == {}
+    assert set(got.reasons) == {"lpips"}
     assert list(got.per_view) == ["view_00", "view_01", "view_02"]
 
 
@@ -69,7 +76,7 @@ def test_means_of_the_kinds_are_over_their_categories():
 
 def test_object_labels_alone_give_lerf_ovs():
     got = score(scene(dense=False, objects=True))
-    assert got.protocol == "lerf_ovs@1 split=synthetic"
+    assert got.protocol == "lerf_ovs@1/synthetic"
     assert set(got.per_category) == set(OBJECTS)
     assert (got.beside["hits_lerf_ovs"], got.beside["units_lerf_ovs"]) == (9, 9)
     assert got.loc_acc == 1
@@ -80,11 +87,11 @@ def test_object_labels_alone_give_lerf_ovs():
 
 def test_the_headline_can_be_chosen():
     both = scene(dense=True, objects=True)
-    got = score(both, protocol=EvaluationProtocol("lerf_ovs", strict=True))
-    assert got.protocol == "lerf_ovs-strict@1 split=synthetic"
+    got = score(both, protocol=LerfOvs(strict=True))
+    assert got.protocol == "lerf_ovs_strict@1/synthetic"
     assert got.miou == got.beside["miou_lerf_ovs"]
     assert got.beside["miou_dense"] == 1
-    dense = score(scene(dense=False, objects=True), protocol=EvaluationProtocol("dense"))
+    dense = score(scene(dense=False, objects=True), protocol=Dense())
     assert dense.miou is None
     assert dense.reasons["miou"] == "no held-out view has a class for any pixel"
 
@@ -175,3 +182,79 @@ def test_labels_of_an_unknown_class_are_refused():
     )
     with pytest.raises(ValueError, match=r"labels of view 'odd' must be among .* got \['zebra'\]"):
         score(with_test(scene(), odd))
+
+
+@pytest.mark.parametrize(
+    ("protocol", "name"),
+    [
+        (Ovs3dArgmax(), "ovs3d_argmax@1/synthetic"),
+        (Ovs3dThreshold(), "ovs3d_threshold@1/synthetic"),
+        (Goi(), "mipnerf360_goi@1/synthetic"),
+        (LerfOvs(), "lerf_ovs@1/synthetic"),
+    ],
+)
+def test_every_protocol_can_be_the_headline(protocol: EvaluationProtocol, name: str):
+    got = score(scene(objects=True), protocol=protocol)
+    assert got.protocol == name
+    assert got.failure is None
+    assert got.miou is not None
+    assert got.miou > 0.6
+    assert got.beside["miou_dense"] == 1
+    assert got.beside["boundary_iou"] is not None
+    assert ("loc_acc" in got.reasons) == (got.loc_acc is None)
+
+
+def test_selection_in_3d_asks_the_gaussians():
+    # The fake's Gaussians carry no code, so none is relevant above a tie and nothing is selected: an honest 0.
+    got = score(scene(objects=True), protocol=Select3d())
+    assert (got.miou, got.beside["acc25"]) == (0, 0)
+    assert got.protocol == "select3d@1/synthetic"
+
+
+def test_three_levels_are_three_models():
+    where = scene(objects=True)
+    text = VocabularyText(where.vocabulary)
+    models = [FakeModel(5.0), FakeModel(5.0), FakeModel()]
+    got = evaluate(models, where, LerfRelevancy(), text, LerfOvs())
+    alone = evaluate(models[:1], where, LerfRelevancy(), text, LerfOvs())
+    assert alone.psnr == got.psnr  # colour is that of the first
+    assert alone.loc_acc is not None
+    assert got.loc_acc is not None
+    assert got.loc_acc >= alone.loc_acc
+    rows = [row for row in got.queries if row["protocol"] == "lerf_ovs@1/synthetic"]
+    assert {row["level"] for row in rows} <= {0, 1, 2}
+    with pytest.raises(ValueError, match="at least one model, got none"):
+        evaluate([], where, LerfRelevancy(), text, LerfOvs())
+
+
+def test_every_query_is_kept():
+    got = score(scene(2, objects=True), noise=0.5)
+    rows = [row for row in got.queries if row["protocol"] == "lerf_ovs@1/synthetic"]
+    assert [(row["view"], row["category"]) for row in rows] == [
+        (f"view_{i:02}", name) for i in range(2) for name in OBJECTS
+    ]
+    ious = [row["iou"] for row in rows]
+    assert got.beside["miou_lerf_ovs"] == pytest.approx(sum(ious) / len(ious))  # type: ignore[arg-type]
+    assert {row["kind"] for row in rows} == {"translucent_reflective", "other"}
+    dense = [row for row in got.queries if row["protocol"] == "dense@1/synthetic"]
+    for name in OBJECTS:  # counts are enough to make the pooled IoU again
+        of = [row for row in dense if row["category"] == name]
+        both, true, chosen = (
+            sum(int(row[key]) for row in of)  # type: ignore[arg-type]
+            for key in ("both_pixels", "true_pixels", "selected_pixels")
+        )
+        assert got.per_category[name] == pytest.approx(both / (true + chosen - both))
+
+
+def test_scores_that_were_asked_for_and_are_not_there_are_a_failure():
+    assert score(scene(dense=False)).failure is None  # nothing is labelled, and nothing was asked
+    asked = score(scene(dense=False), protocol=LerfOvs())
+    assert asked.miou is None
+    assert asked.failure is not None
+    assert "no held-out view has a labelled object" in asked.failure
+    nothing = torch.full((150, 200), IGNORE_ID, dtype=torch.uint8)
+    blank = replace(view(Drawing(), "blank"), read_dense_labels=lambda: DenseLabels(nothing))
+    empty = score(with_test(scene(), blank))
+    assert empty.miou is None
+    assert empty.failure is not None
+    assert "no held-out view has a class for any pixel" in empty.failure

@@ -7,16 +7,17 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from rich.console import Console
 
 from vlgs.report.evaluate import Evaluation
 from vlgs.report.provenance import _cpu_model, commit, machine
-from vlgs.report.results import METRICS, metrics_table, write_metrics
+from vlgs.report.results import METRICS, metrics_table, write_metrics, write_queries
 from vlgs.report.summary import print_summary
 
 EVALUATION = Evaluation(
-    protocol="dense@1 split=synthetic",
+    protocol="dense@1/synthetic",
     psnr=27.5,
     ssim=0.91,
     miou=0.615,
@@ -43,6 +44,21 @@ def test_metrics_are_flat_and_strict_json(tmp_path: Path):
     assert written["fps_color"] is None
     assert written["per_view"] == {"view_00": {"psnr": None, "ssim": None}}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_queries_are_a_list_that_pandas_reads(tmp_path: Path):
+    rows = ({"view": "v", "category": "a", "iou": 0.5}, {"view": "v", "category": "b", "iou": None})
+    write_queries(tmp_path / "q.json", replace(EVALUATION, queries=rows))
+    table = pd.read_json(tmp_path / "q.json")
+    assert table["category"].tolist() == ["a", "b"]
+    assert table["iou"].isna().tolist() == [False, True]
+
+
+def test_a_failure_is_shown(tmp_path: Path):
+    failed = replace(EVALUATION, failure="dense@1/all: nothing could be scored")
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_summary(write_metrics(tmp_path / "m.json", failed, {}), {}, console)
+    assert "failed: dense@1/all: nothing could be scored" in console.export_text()
 
 
 def test_every_entry_is_documented(tmp_path: Path):
@@ -74,7 +90,7 @@ def test_summary_shows_scores_reasons_and_unbroken_paths(tmp_path: Path):
     long_path = Path("/a/rather/long/path/to/a/run/folder/of/results/overview.png")
     print_summary(written, {"pictures": long_path, "run": Path("/x")}, console)
     text = console.export_text()
-    for part in ("27.50 dB", "61.5%", "12,345", "wine glass", "dense@1 split=synthetic"):
+    for part in ("27.50 dB", "61.5%", "12,345", "wine glass", "dense@1/synthetic"):
         assert part in text
     assert "loc_acc: no held-out view has a labelled object" in text
     assert f"pictures  {long_path}\n" in text

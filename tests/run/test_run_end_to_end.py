@@ -11,7 +11,7 @@ import pytest
 from tiny_runs import TINY, composed
 
 from vlgs.report.results import METRICS
-from vlgs.run import run
+from vlgs.run import UNSCORED, run
 from vlgs.runs import RunFolder
 
 SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30")
@@ -51,11 +51,14 @@ def test_a_run_leaves_everything_the_manual_promises(finished: Path):
     ):
         assert metrics[name] is not None
         assert metrics[name] >= 0
-    assert metrics["protocol"] == "dense@1 split=synthetic"
+    assert metrics["protocol"] == "dense@1/synthetic"
     assert metrics["config_hash"] == folder.path.name
     assert metrics["ply_bytes"] == folder.ply.stat().st_size
     assert set(metrics["per_category"]) >= {"wine glass", "wall"}
     assert metrics["test_views_seen"] == 0
+    queries = json.loads(folder.queries.read_text())
+    assert {row["protocol"] for row in queries} == {"dense@1/synthetic", "lerf_ovs@1/synthetic"}
+    assert metrics["failure"] is None
     assert (folder.renders / "overview.png").is_file()
     views = [path for path in folder.renders.iterdir() if path.is_dir()]
     assert len(views) == 2
@@ -85,6 +88,15 @@ def test_a_finished_run_is_reported_not_repeated(
     assert run(composed(*SHORT, f"results={finished}", "threads=1", "pictures=false")) == 0
     assert "PSNR" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_a_run_without_the_scores_that_were_asked_for_fails(finished: Path, tmp_path: Path):
+    shutil.copytree(finished, tmp_path / "copy")
+    folder = only_run(tmp_path / "copy")
+    metrics = json.loads(folder.metrics.read_text())
+    folder.metrics.write_text(json.dumps(metrics | {"failure": "nothing could be scored"}))
+    status = run(composed(*SHORT, f"results={tmp_path / 'copy'}", "pictures=false"))
+    assert status == UNSCORED != 0
 
 
 def test_an_existing_run_can_be_refused(finished: Path):

@@ -7,6 +7,7 @@ from rich.console import Console
 
 from vlgs.bench.kernel import SIZES, measure_kernel, show_table, write_csv
 from vlgs.bench.overhead import measure_overhead
+from vlgs.bench.protocols import measure_protocols, show_protocols
 
 
 def main() -> None:
@@ -23,7 +24,15 @@ def main() -> None:
     )
     overhead = commands.add_parser("overhead", help="what the Trainer adds to an iteration")
     overhead.add_argument("--iterations", type=int, default=300)
+    protocols = commands.add_parser("protocols", help="scores of many queries, without rendering")
+    protocols.add_argument("--queries", type=int, default=300)
+    protocols.add_argument("--levels", type=int, default=3, help="mask levels")
+    protocols.add_argument("--size", type=int, nargs=2, default=(986, 728), metavar=("W", "H"))
     args = parser.parse_args()
+    if args.command == "protocols":
+        costs = measure_protocols(args.queries, args.levels, *args.size)
+        Console().print(show_protocols(costs))
+        return
     if args.command == "overhead":
         cost = measure_overhead(args.iterations)
         Console().print(f"step {cost.step:.2f} ms, around it {cost.around:.2f} ms (medians)")

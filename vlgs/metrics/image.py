@@ -1,9 +1,12 @@
 """PSNR and SSIM of a rendered view against its photograph, both on [0, 1] and over the pixels the photograph covers (B.5)."""
 
 import math
+from typing import Literal
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 NAME = "image"
 VERSION = 1
@@ -34,23 +37,55 @@ def ssim(
     image: Float[Tensor, "h w 3"],
     truth: Float[Tensor, "h w 3"],
     valid: Bool[Tensor, "h w"] | None = None,
+    border: Literal["mirror", "zero"] = "mirror",
 ) -> float | None:
-    """Structural similarity in [-1, 1]: 11x11 Gaussian window of sigma 1.5, borders mirrored; None without a valid pixel.
+    """Structural similarity in [-1, 1], 11x11 Gaussian window of sigma 1.5; None without a valid pixel.
 
-    Computed in float64, where E[x^2] - E[x]^2 of a flat image stays clean (pitfalls.md N15). 3DGS pads with zeros instead, which
-    moves the third to fourth decimal.
+    Computed in float64, where E[x^2] - E[x]^2 of a flat image stays clean (pitfalls.md N15).
+
+    Args:
+        image: What was rendered.
+        truth: The photograph.
+        valid: Pixels that count.
+        border: ``mirror``: windows see the image mirrored beyond its border, as in torchmetrics. ``zero``: they see black, as in
+            3DGS, which moves the third to fourth decimal.
 
     Raises:
         ValueError: If a side is shorter than 6 pixels, too short to mirror the window.
     """
-    from kornia.metrics import ssim as ssim_map  # half a second to import
-
     if min(image.shape[:2]) < 6:
         raise ValueError(
             f"ssim: images must be at least 6x6 pixels, got {image.shape[0]}x{image.shape[1]}"
         )
     a, b = (x.double().permute(2, 0, 1)[None] for x in (image, truth))
-    values = ssim_map(a, b, window_size=11, max_val=1.0, eps=0.0)[0].mean(dim=0)  # [h, w]
+    if border == "zero":
+        values = _ssim_zero_padded(a, b)
+    else:
+        from kornia.metrics import ssim as ssim_map  # half a second to import
+
+        values = ssim_map(a, b, window_size=11, max_val=1.0, eps=0.0)
+    values = values[0].mean(dim=0)  # [h, w]
     if valid is not None:
         values = values[valid]
     return values.mean().clamp(-1, 1).item() if values.numel() else None
+
+
+def _ssim_zero_padded(a: Float[Tensor, "1 c h w"], b: Float[Tensor, "1 c h w"]) -> Tensor:
+    """SSIM of every pixel [1, c, h, w], windows zero beyond the border."""
+    at = torch.arange(-5, 6, dtype=a.dtype)
+    window = torch.exp(-at.square() / (2 * 1.5**2))
+    window /= window.sum()
+    stacked = torch.cat([a, b, a * a, b * b, a * b]).flatten(0, 1)[:, None]
+    mean = conv2d(
+        conv2d(stacked, window[None, None, None], padding=(0, 5)),
+        window[None, None, :, None],
+        padding=(5, 0),
+    )
+    ma, mb, aa, bb, ab = mean[:, 0].chunk(5)
+    c1, c2 = 0.01**2, 0.03**2
+    similar = (2 * ma * mb + c1) * (2 * (ab - ma * mb) + c2)
+    return (similar / ((ma**2 + mb**2 + c1) * (aa - ma**2 + bb - mb**2 + c2)))[None]
+
+
+NO_LPIPS = "LPIPS needs a pretrained AlexNet or VGG from torchvision (also in torchmetrics, lpips and piq), which is not a dependency"
+"""Why `lpips` is not available in any result."""

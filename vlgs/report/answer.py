@@ -36,6 +36,11 @@ class Fused(Protocol):
         ...
 
     @property
+    def feature(self) -> Float[Tensor, "n d"]:
+        """Language code of each Gaussian, as it is blended."""
+        ...
+
+    @property
     def language_weight(self) -> Float[Tensor, " n"]:
         """What blends language, l in general."""
         ...

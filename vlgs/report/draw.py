@@ -8,7 +8,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vlgs.metrics.dense import predict_classes
-from vlgs.metrics.lerf_ovs import LANGSPLAT, Unit, box_mean, segment
+from vlgs.metrics.masks import Unit
+from vlgs.metrics.segment import blend, segment, smooth
 from vlgs.query import Prompts, Query
 from vlgs.report import colors
 from vlgs.report.answer import Answer, Fused, ViewModel, answer_view
@@ -133,9 +134,7 @@ class Painter:
         pictures = {}
         for unit in units:
             raw = relevancy[self.prompts.names.index(unit.category)]
-            blended = (
-                raw + box_mean(raw[None], LANGSPLAT.box)[0]
-            ) / 2  # what the protocol segments
+            blended = blend(raw[None], smooth(raw[None]))[0]  # what LERF-OVS segments
             pictures[unit.category] = PromptPictures(
                 relevancy=colors.heat_over(photograph, colors.stretch(blended)),
                 segmentation=colors.mask_over(photograph, segment(blended), unit.mask),
@@ -148,7 +147,7 @@ class Painter:
         assert self.prompts is not None
         assert answer.cosines is not None  # there are prompts
         count = len(self.prompts.names)
-        prediction = predict_classes(answer.cosines)
+        prediction = predict_classes([answer.cosines])
         shown = {*truth.unique().tolist(), *prediction.unique().tolist()} - {IGNORE_ID}
         return replace(
             pictures,

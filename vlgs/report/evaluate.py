@@ -1,16 +1,19 @@
 """Scores of a trained scene on its held-out views."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 
 from vlgs.metrics import image
+from vlgs.metrics.masks import QueryScore
 from vlgs.metrics.mean import mean_of_known
-from vlgs.metrics.protocol import EvaluationProtocol
+from vlgs.metrics.protocol import Auto, EvaluationProtocol, tag
 from vlgs.query import Prompts, Query, TextEncoder, encode_prompts
 from vlgs.report.answer import Answer, ViewModel, answer_view
-from vlgs.report.language import LanguageScores, LanguageTally
+from vlgs.report.language import DENSE, LERF_OVS, LanguageScores, LanguageTally
+from vlgs.report.splats import SplatAnswers
 from vlgs.types import Scene, View
 
 
@@ -19,7 +22,7 @@ class Evaluation:
     """Scores of one run. None is not available, and `reasons` says why; it is never 0 or 1 by default."""
 
     protocol: str
-    """Name and version of the headline's protocol and the split, such as ``dense@1 split=synthetic``."""
+    """`vlgs.metrics.protocol.tag` of the headline: name, version and split, such as ``dense@1/synthetic``."""
     psnr: float | None
     """Mean over views, dB."""
     ssim: float | None
@@ -36,46 +39,70 @@ class Evaluation:
     """Further figures under the names of `vlgs.report.results.METRICS`."""
     reasons: Mapping[str, str] = field(default_factory=dict)
     """Metric -> why it is not available; faults of the labels stand under ``labels``."""
+    failure: str | None = None
+    """Why the evaluation failed: a protocol or labels asked for scores, and nothing could be scored."""
+    queries: Sequence[Mapping[str, str | int | float | bool | None]] = ()
+    """Rows of `query_rows`."""
 
 
 @torch.no_grad()
 def evaluate(
-    model: ViewModel,
+    model: ViewModel | Sequence[ViewModel],
     scene: Scene,
     query: Query,
     text: TextEncoder | None,
-    protocol: EvaluationProtocol,
+    protocol: EvaluationProtocol | Auto,
 ) -> Evaluation:
     """Render every held-out view once and score colour and language.
 
-    Dense labels give the dense scores; localisation beside them is the strict form. Units of LERF-OVS come from object labels
-    where a view has them, otherwise one per class that its dense labels show: such a unit has no box, and a hit is a pixel of
-    its mask. The ceiling is what LERF-OVS gives to exact features, where every pixel carries the text vector of its true class.
+    Units of LERF-OVS come from object labels where a view has them, otherwise one per class that its dense labels show: such a
+    unit has no box, and a hit is a pixel of its mask. The ceiling is what LERF-OVS gives to exact features, where every pixel
+    carries the text vector of its true class.
 
     Args:
-        model: The trained scene.
+        model: The trained scene, or one per mask level, finest first (``levels=separate``); colour is then that of the first.
         scene: Its held-out views, labels and classes.
-        query: Relevancy for LERF-OVS; the dense protocol needs none.
+        query: Relevancy of a prompt.
         text: Encodes `Scene.classes`. Without it, or if it lacks a word, there are no language scores, and the reason is given.
-        protocol: Which scores are the headline.
+        protocol: Which scores are the headline; the dense ones and those of LERF-OVS stand beside them.
 
     Raises:
-        ValueError: If labels name what `Scene.classes` does not have, or differ in size from the view.
+        ValueError: If there is no model, or labels name what `Scene.classes` does not have or differ in size from the view.
     """
+    models = model if isinstance(model, Sequence) else (model,)
+    if not models:
+        raise ValueError("evaluate: there must be at least one model, got none")
+    headline = _resolve(protocol, scene)
     prompts, reason = prompts_of(scene, query, text)
-    tally = LanguageTally(query, prompts) if prompts is not None else None
-    fused, per_view = model.fuse(), {}
+    fused, per_view = [level.fuse() for level in models], {}
+    tally = splats = None
+    if prompts is not None:
+        tally = LanguageTally(query, prompts, headline)
+        splats = SplatAnswers(models, fused, query, prompts)
     for view in scene.test:
-        answer = answer_view(model, view.camera, prompts, fused)
-        per_view[view.name] = _image_scores(view, answer)
-        if tally is not None:
-            tally.add(view, answer)
-    headline = protocol.resolve(any(view.read_dense_labels is not None for view in scene.test))
+        answers = [
+            answer_view(level, view.camera, prompts, shared)
+            for level, shared in zip(models, fused, strict=True)
+        ]
+        per_view[view.name] = _image_scores(view, answers[0])
+        if tally is not None and splats is not None:
+            tally.add(view, answers, partial(splats.seen_by, view.camera))
     if tally is not None:
-        language = tally.conclude(headline, protocol.strict, scene.class_kinds)
+        language = tally.conclude(scene.class_kinds)
     else:
-        language = LanguageScores(None, None, {}, {}, {"miou": reason, "loc_acc": reason})
-    return _conclude(scene, protocol.tag(headline), per_view, language)
+        language = LanguageScores(None, None, {}, {}, {"miou": reason, "loc_acc": reason}, {})
+    asked = not isinstance(protocol, Auto) or (prompts is not None and _is_labelled(scene))
+    return _conclude(scene, tag(headline, scene.split), per_view, language, asked)
+
+
+def _resolve(protocol: EvaluationProtocol | Auto, scene: Scene) -> EvaluationProtocol:
+    if not isinstance(protocol, Auto):
+        return protocol
+    return DENSE if any(view.read_dense_labels is not None for view in scene.test) else LERF_OVS
+
+
+def _is_labelled(scene: Scene) -> bool:
+    return any(view.read_dense_labels or view.read_object_labels for view in scene.test)
 
 
 def prompts_of(scene: Scene, query: Query, text: TextEncoder | None) -> tuple[Prompts | None, str]:
@@ -96,26 +123,32 @@ def _image_scores(view: View, answer: Answer) -> dict[str, float | None]:
     return {
         "psnr": image.psnr(answer.color, photograph, valid),
         "ssim": image.ssim(answer.color, photograph, valid),
+        "ssim_3dgs": image.ssim(answer.color, photograph, valid, border="zero"),
     }
 
 
 def _conclude(
     scene: Scene,
-    tag: str,
+    name: str,
     per_view: dict[str, dict[str, float | None]],
     language: LanguageScores,
+    asked: bool,
 ) -> Evaluation:
-    psnr, ssim = (
-        mean_of_known(scores[metric] for scores in per_view.values()) for metric in ("psnr", "ssim")
+    psnr, ssim, ssim_3dgs = (
+        mean_of_known(scores[metric] for scores in per_view.values())
+        for metric in ("psnr", "ssim", "ssim_3dgs")
     )
-    reasons = dict(language.reasons)
+    reasons = {**language.reasons, "lpips": image.NO_LPIPS}
     if psnr is None:
         reasons["psnr"] = reasons["ssim"] = (
             "no held-out pixel is valid" if scene.test else "there are no held-out views"
         )
+    failure = None
+    if asked and language.miou is None:
+        failure = f"{name}: nothing could be scored, {reasons['miou']}"
     trained = {view.name for view in scene.train}
     return Evaluation(
-        protocol=f"{tag} split={scene.split}",
+        protocol=name,
         psnr=psnr,
         ssim=ssim,
         miou=language.miou,
@@ -124,8 +157,36 @@ def _conclude(
         per_view=per_view,
         beside={
             **language.beside,
+            "ssim_3dgs": ssim_3dgs,
+            "lpips": None,
             "test_views": len(scene.test),
             "test_views_seen": sum(view.name in trained for view in scene.test),
         },
         reasons=reasons,
+        failure=failure,
+        queries=query_rows(language.queries, scene),
     )
+
+
+def query_rows(
+    queries: Mapping[EvaluationProtocol, Sequence[QueryScore]], scene: Scene
+) -> list[dict[str, str | int | float | bool | None]]:
+    """One flat row per protocol, view and category, as `RunFolder.queries` keeps them."""
+    return [
+        {
+            "protocol": tag(protocol, scene.split),
+            "view": score.view,
+            "category": score.category,
+            "kind": scene.class_kinds.get(score.category),
+            "iou": score.iou,
+            "boundary_iou": score.boundary_iou,
+            "hit": score.hit,
+            "level": score.level,
+            "both_pixels": score.both,
+            "selected_pixels": score.selected,
+            "true_pixels": score.true,
+            "pixels": score.pixels,
+        }
+        for protocol, scores in queries.items()
+        for score in scores
+    ]

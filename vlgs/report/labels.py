@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from jaxtyping import UInt8
 from torch import Tensor
 
-from vlgs.metrics.lerf_ovs import Unit
+from vlgs.metrics.masks import Unit
 from vlgs.types import IGNORE_ID, View
 
 

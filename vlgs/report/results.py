@@ -12,12 +12,22 @@ from vlgs.report.evaluate import Evaluation
 METRICS: Mapping[str, tuple[str, str]] = {
     "psnr": ("dB", "mean over held-out views, colours clamped to [0, 1]"),
     "ssim": ("-1..1", "mean over held-out views, 11x11 Gaussian window, mirrored borders"),
+    "ssim_3dgs": ("-1..1", "ssim with borders padded by zeros, as 3DGS computes it"),
+    "lpips": ("", "not available, see reasons"),
     "miou": ("0..1", "mIoU under `protocol`"),
     "loc_acc": ("0..1", "localisation accuracy under `protocol`"),
     "per_category": ("0..1", "category -> IoU under `protocol`"),
-    "protocol": ("", "what miou and loc_acc mean: name@version split=..."),
+    "protocol": ("", "what miou and loc_acc mean: name@version[settings]/split"),
     "miou_<kind>": ("0..1", "mean IoU of the categories of a kind, e.g. translucent_reflective"),
     "miou_dense": ("0..1", "argmax over all classes, pixels of all held-out views together"),
+    "miou_dense_present": ("0..1", "miou_dense over the classes that the truth shows"),
+    "boundary_iou": ("0..1", "mean Boundary IoU of the queries under `protocol`"),
+    "hits": ("", "hits of loc_acc, for LERF-OVS as the headline"),
+    "units": ("", "queries of loc_acc, for LERF-OVS as the headline"),
+    "mask_accuracy": ("0..1", "mean share of a view's pixels that a mask has right (GOI's mPA)"),
+    "mask_precision": ("0..1", "mean share of a mask that is true (GOI's mP)"),
+    "acc25": ("0..1", "queries with IoU above 0.25, for select3d"),
+    "acc50": ("0..1", "queries with IoU above 0.5, for select3d"),
     "pixel_accuracy": ("0..1", "share of pixels whose class is right"),
     "miou_lerf_ovs": ("0..1", "relevancy over threshold, mean over units (view, category)"),
     "loc_acc_lerf_ovs": ("0..1", "hits / units"),
@@ -42,6 +52,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "commit": ("", "git commit, +dirty with local changes, null for an installed wheel"),
     "machine": ("", "cpu, cores, threads, torch, platform"),
     "per_view": ("", "held-out view -> psnr, ssim"),
+    "failure": ("", "why nothing could be scored although it was asked for; null for a good run"),
     "reasons": ("", "metric that is null -> why"),
 }
 """Entry of metrics.json -> (unit or range, meaning). An entry that could not be computed is null."""
@@ -67,6 +78,7 @@ def write_metrics(path: Path, evaluation: Evaluation, extra: Mapping[str, Any]) 
         "miou": evaluation.miou,
         "loc_acc": evaluation.loc_acc,
         "protocol": evaluation.protocol,
+        "failure": evaluation.failure,
         **evaluation.beside,
     }
     details = {
@@ -83,6 +95,12 @@ def write_metrics(path: Path, evaluation: Evaluation, extra: Mapping[str, Any]) 
     metrics = _finite({**scores, **extra, **details})
     write_atomically(path, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     return metrics
+
+
+def write_queries(path: Path, evaluation: Evaluation) -> None:
+    """Write the rows of `Evaluation.queries` as a JSON list, which pandas reads with ``read_json``."""
+    rows = [_finite(row) for row in evaluation.queries]
+    write_atomically(path, (json.dumps(rows, indent=0, allow_nan=False) + "\n").encode())
 
 
 def metrics_table() -> str:

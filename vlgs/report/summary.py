@@ -28,6 +28,7 @@ _ROWS = (
     ("fps_language", "language render", "{:.1f} /s"),
     ("fps_query", "query", "{:.1f} /s"),
 )
+_SILENT = ("lpips",)  # never available, which metrics.json says
 _ALWAYS = ("psnr", "ssim", "miou", "loc_acc")
 
 
@@ -49,7 +50,10 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     per_category = metrics.get("per_category") or {}
     for category, iou in per_category.items():
         table.add_row(Text(f"  {category}"), "--" if iou is None else f"{iou:.1%}", style="dim")
-    notes = [Text(f"{name}: {why}", style="yellow") for name, why in metrics["reasons"].items()]
+    reasons = {name: why for name, why in metrics["reasons"].items() if name not in _SILENT}
+    notes = [Text(f"{name}: {why}", style="yellow") for name, why in reasons.items()]
+    if metrics.get("failure"):
+        notes.append(Text(f"failed: {metrics['failure']}", style="bold red"))
     width = max((len(label) for label in paths), default=0)
     places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
     return Group(table, *notes, Text(f"protocol: {metrics['protocol']}"), *places)
