@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from report_fakes import CLASSES, Drawing, FakeModel, scene, view, vocabulary, with_test
+from report_fakes import CLASSES, Drawing, FakeFused, FakeModel, scene, view, vocabulary, with_test
 
 from vlgs.metrics.dense import Dense
 from vlgs.metrics.goi import Goi
@@ -16,7 +16,7 @@ from vlgs.query import LerfRelevancy, VocabSoftmax
 from vlgs.query.text import VocabularyText
 from vlgs.report.evaluate import Evaluation, evaluate, prompts_of
 from vlgs.report.language import LanguageTally
-from vlgs.types import IGNORE_ID, DenseLabels, ObjectLabels, Scene
+from vlgs.types import IGNORE_ID, Camera, DenseLabels, Gaussians, ObjectLabels, Scene
 
 AUTO = Auto()
 OBJECTS = CLASSES[2:5]
@@ -204,11 +204,35 @@ def test_every_protocol_can_be_the_headline(protocol: EvaluationProtocol, name: 
     assert ("loc_acc" in got.reasons) == (got.loc_acc is None)
 
 
-def test_selection_in_3d_asks_the_gaussians():
-    # The fake's Gaussians carry no code, so none is relevant above a tie and nothing is selected: an honest 0.
-    got = score(scene(objects=True), protocol=Select3d())
-    assert (got.miou, got.beside["acc25"]) == (0, 0)
-    assert got.protocol == "select3d@1/synthetic"
+class TwoGaussians(FakeModel):
+    """The kettle as one Gaussian and the apple as another; a silhouette is what has weight."""
+
+    def fuse(self) -> FakeFused:
+        fused = super().fuse()
+        codes = vocabulary(CLASSES).vectors[[3, 4]]
+        two = {key: value[:2] for key, value in vars(fused.gaussians).items()} | {"features": codes}
+        return FakeFused(Gaussians(**two), torch.tensor([0.9, 0.8]))
+
+    def render_values(self, camera: Camera, values: torch.Tensor, weight: torch.Tensor):
+        ids = self._drawing(camera).ids
+        shown = [(ids == 3 + i).float()[..., None] * values[i] * weight[i] for i in (0, 1)]
+        return shown[0] + shown[1]
+
+
+def test_selection_in_3d_renders_the_selected_gaussians_alone():
+    where = scene(objects=True)
+    text = VocabularyText(where.vocabulary)
+    got = evaluate(TwoGaussians(), where, VocabSoftmax(), text, Select3d("argmax"))
+    # The glass has no Gaussian; the argmax over classes gives each of the others its own.
+    want = {"wine glass": 0, "steel kettle": 1, "red apple": 1}
+    assert got.per_category == want
+    assert got.miou == pytest.approx(2 / 3)
+    assert got.beside["acc25"] == pytest.approx(2 / 3)
+    assert got.protocol == "select3d@1[rule=argmax]/synthetic"
+    faint = evaluate(
+        TwoGaussians(), where, VocabSoftmax(), text, Select3d("argmax", silhouette=0.85)
+    )
+    assert faint.per_category["red apple"] == 0  # its weight is 0.8
 
 
 def test_three_levels_are_three_models():

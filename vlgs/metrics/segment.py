@@ -82,7 +82,7 @@ def segment(blended: Float[Tensor, "h w"], constants: Constants = LANGSPLAT) -> 
     return vote(normalised > constants.threshold, constants.vote)
 
 
-def check_relevancy(who: str, relevancy: Float[Tensor, "levels *p"], category: str) -> None:
+def check_relevancy(who: str, relevancy: Float[Tensor, " levels *p"], category: str) -> None:
     """Refuse what cannot be scored, so that no NaN becomes a score.
 
     Raises:
