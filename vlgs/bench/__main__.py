@@ -3,8 +3,11 @@
 import argparse
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
+from vlgs.bench.iteration import SIZES as ITERATIONS
+from vlgs.bench.iteration import measure_iteration, show_iterations
 from vlgs.bench.kernel import SIZES, measure_kernel, show_table, write_csv
 from vlgs.bench.overhead import measure_overhead
 
@@ -23,7 +26,17 @@ def main() -> None:
     )
     overhead = commands.add_parser("overhead", help="what the Trainer adds to an iteration")
     overhead.add_argument("--iterations", type=int, default=300)
+    iteration = commands.add_parser("iteration", help="parts of a training iteration by CPU time")
+    iteration.add_argument("--sizes", type=int, nargs="+", default=range(len(ITERATIONS)))
+    iteration.add_argument("--iterations", type=int, default=20)
+    iteration.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
+    if args.command == "iteration":
+        torch.set_num_threads(args.threads)
+        sizes = [ITERATIONS[i] for i in args.sizes]
+        measured = [(size, measure_iteration(size, args.iterations)) for size in sizes]
+        Console().print(show_iterations(measured))
+        return
     if args.command == "overhead":
         cost = measure_overhead(args.iterations)
         Console().print(f"step {cost.step:.2f} ms, around it {cost.around:.2f} ms (medians)")

@@ -3,18 +3,21 @@
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from hydra import compose, initialize_config_dir
 from rich.table import Table
 
 from vlgs.config import CONF, instantiate
+from vlgs.fusion import attention
 from vlgs.module.build import Parts, build_module
 from vlgs.module.lightning import VLGSModule
+from vlgs.render import cpu
 
 KERNELS = ("project", "blend", "fusion", "Adam")
 """Parts that are not overhead: everything else is called the rest."""
@@ -41,44 +44,86 @@ class IterationSize:
 SIZES = (IterationSize(5_000, 200, 150, 40, 0), IterationSize(100_000, 986, 728, 4, 3))
 
 
-@dataclass
 class Stopwatch:
-    """CPU seconds of all threads, per part, of the iteration under way."""
+    """CPU seconds of all threads per part; what a part calls counts for the inner one only."""
 
-    parts: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    def __init__(self) -> None:
+        self.parts: dict[str, float] = defaultdict(float)
+        self._open: list[str] = []
+        self._since = 0.0
 
     def around(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         """The call, timed."""
 
         def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.process_time()
+            self._book()
+            self._open.append(part)
             try:
                 return call(*args, **kwargs)
             finally:
-                self.parts[part] += time.process_time() - start
+                self._book()
+                self._open.pop()
 
         return timed
+
+    def _book(self) -> None:
+        now = time.process_time()
+        if self._open:
+            self.parts[self._open[-1]] += now - self._since
+        self._since = now
 
 
 def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
     """Median CPU milliseconds of every part of an iteration, after three that are not counted.
 
-    Keys are `KERNELS`, parts of the rest that were timed, and ``total``.
+    An iteration is `VLGSModule.training_step` and the statistics of densification. Keys are `KERNELS`, the parts of the
+    rest, and ``total``.
     """
     watch = Stopwatch()
     rows: list[dict[str, float]] = []
-    with _timed_kernels(watch):
+    with ExitStack() as patches:
         module = _module(size)
-        module.optimizer.step = watch.around("Adam", module.optimizer.step)
-        module.optimizer.zero_grad = watch.around("zero_grad", module.optimizer.zero_grad)
-        module.target = watch.around("targets", module.target)
-        for step in range(iterations + 3):
+        for owner, name, part in _timed(module):
+            call = watch.around(part, getattr(owner, name))
+            made = staticmethod(call) if isinstance(owner, type) else call
+            patches.enter_context(patch.object(owner, name, made))
+        first = size.sh_degree * module.settings.sh_every
+        statistics = watch.around("densification statistics", _gather_statistics)
+        step = watch.around("step, what is left", module.training_step)
+        for index in range(first, first + iterations + 3):
             watch.parts.clear()
-            start = time.process_time()
-            module.training_step(step + size.sh_degree * module.settings.sh_every, step)
-            rows.append({**watch.parts, "total": time.process_time() - start})
+            step(index, index)
+            statistics(module)
+            rows.append({**watch.parts, "total": sum(watch.parts.values())})
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: 1e3 * median(row.get(name, 0.0) for row in rows[3:]) for name in names}
+
+
+def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
+    """What is timed, and as which part."""
+    functions = {"project": cpu._Project, "blend": cpu._Blend, "fusion": attention._Attention}
+    for part, function in functions.items():
+        yield function, "forward", part
+        yield function, "backward", part
+    yield module.optimizer, "step", "Adam"
+    yield module.optimizer, "zero_grad", "zero_grad"
+    yield module, "target", "targets"
+    yield module, "similarity", "similarity of the views"
+    yield module, "_backward", "backward of the rest"
+    yield module, "_refuse_non_finite_gradients", "finite check"
+    yield module, "_color_loss", "losses, forward"
+    yield module, "_language_loss", "losses, forward"
+    yield module, "_color_mse", "PSNR of the step"
+    yield module, "_blended_loss", "blended view, forward"
+    yield module.model, "fuse", "activation, forward"
+    yield module.model, "_view_color", "spherical harmonics, forward"
+    yield module.model, "render", "render, what is left"
+
+
+def _gather_statistics(module: VLGSModule) -> None:
+    for gradient, render in zip(module.screen_gradients, module.report.renders, strict=True):
+        height, width = render.alpha_color.shape if render.alpha_color is not None else (1, 1)
+        module.densify_state.accumulate(gradient, render.visible, width, height)
 
 
 def share_of_rest(parts: dict[str, float]) -> float:
@@ -114,15 +159,9 @@ def _module(size: IterationSize) -> VLGSModule:
         f"data.train_views={size.views}",
         f"data.width={size.width}",
         f"data.height={size.height}",
-        f"gaussians.init_points={size.gaussians}",
+        f"data.points={size.gaussians}",
     ]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=overrides)
     parts = Parts(**{part.name: instantiate(config[part.name]) for part in fields(Parts)})
     return build_module(instantiate(config.data), parts, config.seed)
-
-
-@contextmanager
-def _timed_kernels(watch: Stopwatch) -> Iterator[None]:
-    """Time every call into the compiled kernels while this lasts."""
-    raise NotImplementedError
