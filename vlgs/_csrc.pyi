@@ -107,3 +107,24 @@ def attention_backward(
     d_layers: Sequence[Tensor],
     threads: int,
 ) -> None: ...
+def view_color(
+    color: Tensor,
+    sh: Tensor,
+    means: Tensor,
+    eye: Sequence[float],
+    degree: int,
+    out: Tensor,
+    threads: int,
+) -> None: ...
+def view_color_backward(
+    color: Tensor,
+    sh: Tensor,
+    means: Tensor,
+    eye: Sequence[float],
+    degree: int,
+    d_out: Tensor,
+    d_color: Tensor,
+    d_sh: Tensor,
+    d_means: Tensor,
+    threads: int,
+) -> None: ...
