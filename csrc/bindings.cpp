@@ -11,6 +11,7 @@
 #include "attention.h"
 #include "rasterizer.h"
 #include "view_color.h"
+#include "window.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -223,6 +224,23 @@ void bind_view_color(nb::module_ &m) {
       strict("d_sh"), strict("d_means"), "threads"_a);
 }
 
+template <class T>
+void bind_filter(nb::module_ &m) {
+  m.def(
+      "filter",
+      [](Image<const T> planes, Array<const T, kTaps> taps, Image<T> out, int threads) {
+        const Window<T> window{int64_t(planes.shape(0)),
+                               int64_t(planes.shape(1)),
+                               int64_t(planes.shape(2)),
+                               planes.data(),
+                               taps.data(),
+                               out.data()};
+        nb::gil_scoped_release unlocked;
+        filter<T>(window, threads);
+      },
+      strict("planes"), strict("taps"), strict("out"), "threads"_a);
+}
+
 }  // namespace
 }  // namespace vlgs
 
@@ -255,4 +273,6 @@ NB_MODULE(_csrc, m) {
   bind_attention<double>(m);
   bind_view_color<float>(m);
   bind_view_color<double>(m);
+  bind_filter<float>(m);
+  bind_filter<double>(m);
 }

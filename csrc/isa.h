@@ -30,6 +30,8 @@ void attention(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end,
 template <class T>
 void attention_backward(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
                         int64_t end, T *scratch, AttentionLayers<T *> sums);
+template <class T>
+void filter_plane(const Window<T> &, int64_t plane, T *line);
 
 extern const Kernels<float> kFloat;
 extern const Kernels<double> kDouble;

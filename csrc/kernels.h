@@ -9,6 +9,7 @@
 #include <cstdint>
 
 #include "attention.h"
+#include "window.h"
 
 namespace vlgs {
 
@@ -137,6 +138,8 @@ struct Kernels {
   void (*attention)(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch);
   void (*attention_backward)(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
                              int64_t end, T *scratch, AttentionLayers<T *> sums);
+  // One plane; line has room for width + kTaps numbers.
+  void (*filter_plane)(const Window<T> &, int64_t plane, T *line);
 };
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.
