@@ -8,7 +8,10 @@
 #include <algorithm>
 #include <optional>
 
+#include "attention.h"
 #include "rasterizer.h"
+#include "view_color.h"
+#include "window.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -133,6 +136,111 @@ void bind_blend(nb::module_ &m, const char *name) {
           strict("d_weights"), strict("d_values"), "threads"_a);
 }
 
+AttentionShape attention_shape(int64_t color, int64_t feature, int64_t heads, int64_t width, bool self) {
+  return {color, feature, heads, width, self};
+}
+
+// The layers in the order of AttentionLayers, each of the size that the shape gives it.
+template <class T, class Tensor>
+AttentionLayers<T *> layer_pointers(const AttentionShape &shape, const std::vector<Tensor> &tensors) {
+  AttentionLayers<int64_t> sizes = layer_sizes(shape);
+  AttentionLayers<T *> layers;
+  bool fits = int(tensors.size()) == layers.kCount;
+  for (int i = 0; fits && i < layers.kCount; ++i) {
+    fits = int64_t(tensors[i].size()) == sizes[i];
+    layers[i] = tensors[i].data();
+  }
+  if (!fits) throw std::invalid_argument("attention: layers must have the sizes of the shape");
+  return layers;
+}
+
+template <class T>
+void bind_attention(nb::module_ &m) {
+  using Layer = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+  using ConstLayer = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
+  m.def(
+      "attention",
+      [](Rows<const T> color, Rows<const T> feature, const std::vector<ConstLayer> &layers, int64_t heads,
+         int64_t width, bool self, std::optional<Rows<T>> out_color, Rows<T> out_feature, int threads) {
+        const auto shape =
+            attention_shape(int64_t(color.shape(1)), int64_t(feature.shape(1)), heads, width, self);
+        const Attention<T> a{shape, layer_pointers<const T>(shape, layers), color.data(), feature.data()};
+        nb::gil_scoped_release unlocked;
+        attention<T>(a, int64_t(color.shape(0)),
+                     {out_color ? out_color->data() : nullptr, out_feature.data()}, threads);
+      },
+      strict("color"), strict("feature"), strict("layers"), "heads"_a, "width"_a, "self_attention"_a,
+      strict("out_color").none(), strict("out_feature"), "threads"_a);
+  m.def(
+      "attention_backward",
+      [](Rows<const T> color, Rows<const T> feature, const std::vector<ConstLayer> &layers, int64_t heads,
+         int64_t width, bool self, std::optional<Rows<const T>> d_out_color, Rows<const T> d_out_feature,
+         Rows<T> d_color, Rows<T> d_feature, const std::vector<Layer> &d_layers, int threads) {
+        const auto shape =
+            attention_shape(int64_t(color.shape(1)), int64_t(feature.shape(1)), heads, width, self);
+        const Attention<T> a{shape, layer_pointers<const T>(shape, layers), color.data(), feature.data()};
+        const auto d = layer_pointers<T>(shape, d_layers);
+        nb::gil_scoped_release unlocked;
+        attention_backward<T>(a, int64_t(color.shape(0)),
+                              {d_out_color ? d_out_color->data() : nullptr, d_out_feature.data()},
+                              {d_color.data(), d_feature.data()}, d, threads);
+      },
+      strict("color"), strict("feature"), strict("layers"), "heads"_a, "width"_a, "self_attention"_a,
+      strict("d_out_color").none(), strict("d_out_feature"), strict("d_color"), strict("d_feature"),
+      strict("d_layers"), "threads"_a);
+}
+
+template <class T>
+void bind_view_color(nb::module_ &m) {
+  using Color = Array<const T, -1, 3>;
+  using Coefficients = Array<const T, -1, -1, 3>;
+  const auto make = [](const Color &color, const Coefficients &sh, const Color &means,
+                       const std::vector<double> &eye, int degree) {
+    if (eye.size() != 3 || degree < 1 || degree > 3)
+      throw std::invalid_argument("view_color: eye must be 3 numbers, and degree 1, 2 or 3");
+    return ViewColor<T>{
+        int64_t(color.shape(0)), int64_t(sh.shape(1)), degree, color.data(), sh.data(), means.data(),
+        {eye[0], eye[1], eye[2]}};
+  };
+  m.def(
+      "view_color",
+      [make](Color color, Coefficients sh, Color means, const std::vector<double> &eye, int degree,
+             Array<T, -1, 3> out, int threads) {
+        const auto v = make(color, sh, means, eye, degree);
+        nb::gil_scoped_release unlocked;
+        view_color<T>(v, out.data(), threads);
+      },
+      strict("color"), strict("sh"), strict("means"), "eye"_a, "degree"_a, strict("out"), "threads"_a);
+  m.def(
+      "view_color_backward",
+      [make](Color color, Coefficients sh, Color means, const std::vector<double> &eye, int degree,
+             Color d_out, Array<T, -1, 3> d_color, Array<T, -1, -1, 3> d_sh, Array<T, -1, 3> d_means,
+             int threads) {
+        const auto v = make(color, sh, means, eye, degree);
+        nb::gil_scoped_release unlocked;
+        view_color_backward<T>(v, d_out.data(), d_color.data(), d_sh.data(), d_means.data(), threads);
+      },
+      strict("color"), strict("sh"), strict("means"), "eye"_a, "degree"_a, strict("d_out"), strict("d_color"),
+      strict("d_sh"), strict("d_means"), "threads"_a);
+}
+
+template <class T>
+void bind_filter(nb::module_ &m) {
+  m.def(
+      "filter",
+      [](Image<const T> planes, Array<const T, kTaps> taps, Image<T> out, int threads) {
+        const Window<T> window{int64_t(planes.shape(0)),
+                               int64_t(planes.shape(1)),
+                               int64_t(planes.shape(2)),
+                               planes.data(),
+                               taps.data(),
+                               out.data()};
+        nb::gil_scoped_release unlocked;
+        filter<T>(window, threads);
+      },
+      strict("planes"), strict("taps"), strict("out"), "threads"_a);
+}
+
 }  // namespace
 }  // namespace vlgs
 
@@ -161,4 +269,10 @@ NB_MODULE(_csrc, m) {
   bind_project<double>(m);
   bind_blend<float>(m, "BlendFloat");
   bind_blend<double>(m, "BlendDouble");
+  bind_attention<float>(m);
+  bind_attention<double>(m);
+  bind_view_color<float>(m);
+  bind_view_color<double>(m);
+  bind_filter<float>(m);
+  bind_filter<double>(m);
 }

@@ -23,6 +23,15 @@ template <class T>
 void blend(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
 template <class T>
 bool blend_backward(const Pass<T> &, int64_t tile, T *scratch, T *slots);
+template <class T>
+int64_t attention_scratch(const AttentionShape &);
+template <class T>
+void attention(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch);
+template <class T>
+void attention_backward(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
+                        int64_t end, T *scratch, AttentionLayers<T *> sums);
+template <class T>
+void filter_plane(const Window<T> &, int64_t plane, T *line);
 
 extern const Kernels<float> kFloat;
 extern const Kernels<double> kDouble;

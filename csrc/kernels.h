@@ -8,6 +8,9 @@
 
 #include <cstdint>
 
+#include "attention.h"
+#include "window.h"
+
 namespace vlgs {
 
 constexpr int kTile = 16;          // pixels on a side of a tile
@@ -130,6 +133,13 @@ struct Kernels {
   int64_t (*backward_scratch)(const Pass<T> &, int64_t list_length);
   void (*blend)(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
   bool (*blend_backward)(const Pass<T> &, int64_t tile, T *scratch, T *slots);
+  // Gaussians [begin, end); backward adds to sums over them, one per lane.
+  int64_t (*attention_scratch)(const AttentionShape &);
+  void (*attention)(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch);
+  void (*attention_backward)(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
+                             int64_t end, T *scratch, AttentionLayers<T *> sums);
+  // One plane; line has room for width + kTaps numbers.
+  void (*filter_plane)(const Window<T> &, int64_t plane, T *line);
 };
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.

@@ -81,3 +81,51 @@ class BlendFloat:
     ) -> None: ...
 
 class BlendDouble(BlendFloat): ...
+
+def attention(
+    color: Tensor,
+    feature: Tensor,
+    layers: Sequence[Tensor],
+    heads: int,
+    width: int,
+    self_attention: bool,
+    out_color: Tensor | None,
+    out_feature: Tensor,
+    threads: int,
+) -> None: ...
+def attention_backward(
+    color: Tensor,
+    feature: Tensor,
+    layers: Sequence[Tensor],
+    heads: int,
+    width: int,
+    self_attention: bool,
+    d_out_color: Tensor | None,
+    d_out_feature: Tensor,
+    d_color: Tensor,
+    d_feature: Tensor,
+    d_layers: Sequence[Tensor],
+    threads: int,
+) -> None: ...
+def view_color(
+    color: Tensor,
+    sh: Tensor,
+    means: Tensor,
+    eye: Sequence[float],
+    degree: int,
+    out: Tensor,
+    threads: int,
+) -> None: ...
+def view_color_backward(
+    color: Tensor,
+    sh: Tensor,
+    means: Tensor,
+    eye: Sequence[float],
+    degree: int,
+    d_out: Tensor,
+    d_color: Tensor,
+    d_sh: Tensor,
+    d_means: Tensor,
+    threads: int,
+) -> None: ...
+def filter(planes: Tensor, taps: Tensor, out: Tensor, threads: int) -> None: ...

@@ -6,12 +6,14 @@ so that it may be anything, NaN included.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Any, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv2d, l1_loss, mse_loss
+from torch.nn.functional import l1_loss, mse_loss
+
+from vlgs import _csrc
 
 Pixels = Literal["valid", "all"]
 """Whose number an average is divided by: pixels that have a target, or all of them (LangSplat's habit, S. A.2)."""
@@ -221,12 +223,23 @@ _LANGUAGE = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
 
 
 def _filter(planes: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
-    """Gaussian window over each plane, zeros beyond the edge: columns, then rows, all planes in one convolution."""
-    count = planes.shape[0]
-    taps = _taps(planes.dtype).expand(count, 1, SSIM_WINDOW)
-    half = SSIM_WINDOW // 2
-    columns = conv2d(planes[None], taps[..., None], padding=(half, 0), groups=count)
-    return conv2d(columns, taps[:, :, None], padding=(0, half), groups=count)[0]
+    """Gaussian window over each plane, zeros beyond the edge."""
+    return cast(Tensor, _Filter.apply(planes))
+
+
+class _Filter(torch.autograd.Function):
+    """The window is symmetric, so that filtering is its own adjoint; csrc/window.cpp."""
+
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor) -> Tensor:
+        planes = planes.contiguous()
+        out = torch.empty_like(planes)
+        _csrc.filter(planes, _taps(planes.dtype), out, torch.get_num_threads())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, d_out: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _filter(d_out)
 
 
 @cache

@@ -1,10 +1,14 @@
+import math
+import os
+import subprocess
+import sys
+
 import jaxtyping
 import pytest
 import torch
 from torch import Tensor, nn
 
-from vlgs.fusion.attention import CrossAttention, SelfAttention, channel_attention
-from vlgs.fusion.blocks import BLOCK
+from vlgs.fusion.attention import CrossAttention, SelfAttention, Token
 from vlgs.fusion.mlp import MLP
 
 READINGS = [(4, 1), (1, 4), (2, 3)]
@@ -25,7 +29,7 @@ def tokens(layer: nn.Linear, x: Tensor, channels: int, heads: int, width: int) -
 
 def self_attention_by_hand(m: SelfAttention, color: Tensor, feature: Tensor) -> Tensor:
     x = torch.cat([color, feature])
-    _, heads, width = m.token
+    heads, width = m.token
     q, k, v = tokens(m.qkv, x, len(x), heads, width)
     mixed = torch.stack([attend(q[:, h], k[:, h], v[:, h]) for h in range(heads)], dim=1)
     return x + m.out.weight @ mixed.flatten() + m.out.bias
@@ -55,22 +59,75 @@ def test_equals_the_definition_one_gaussian_at_a_time(build, by_hand, width: int
 
 def test_attention_of_two_channels_by_hand():
     # Scores of channel 0 are (0, ln 3), so that its shares are (1/4, 3/4); those of channel 1 are equal.
-    query = torch.tensor([1.0, 0.0]).reshape(1, 2, 1, 1, 1)
-    key = torch.tensor([0.0, 3.0]).log1p().mul(torch.tensor(3.0).log() / torch.tensor(4.0).log())
-    value = torch.tensor([8.0, 4.0]).reshape(1, 2, 1, 1, 1)
-    got = channel_attention(query, key.reshape(1, 2, 1, 1, 1), value)
-    torch.testing.assert_close(got.flatten(), torch.tensor([5.0, 6.0]))
+    fuse = SelfAttention(1, 1, width=1).double()
+    with torch.no_grad():
+        fuse.qkv.weight.zero_()
+        fuse.qkv.bias.copy_(torch.tensor([1, 0, 0, math.log(3), 8, 4], dtype=torch.float64))
+        fuse.out.weight.copy_(torch.eye(2))
+    color, feature = fuse(torch.tensor([[0.5]]).double(), torch.tensor([[-1.0]]).double())
+    torch.testing.assert_close(color.item(), 0.5 + 5.0, rtol=1e-14, atol=0)
+    torch.testing.assert_close(feature.item(), -1.0 + 6.0, rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize(("width", "heads"), READINGS)
-def test_gradient_of_attention(width: int, heads: int):
-    q, k, v = (torch.randn(2, d, heads, width, 2).double().requires_grad_() for d in (3, 2, 2))
-    assert torch.autograd.gradcheck(channel_attention, (q, k, v))
+def batched(build, token: Token, color: Tensor, feature: Tensor, layers: list[Tensor]) -> Tensor:
+    """The formula over all Gaussians, in plain PyTorch; layers as `_attend` takes them."""
+    x = torch.cat([color, feature], dim=1)
+    asking, answering = (x, x) if build is SelfAttention else (feature, color)
+    q_weight, q_bias, kv_weight, kv_bias, out_weight, out_bias = layers
+    q = (asking @ q_weight.T + q_bias).unflatten(1, (-1, *token))
+    k, v = (answering @ kv_weight.T + kv_bias).unflatten(1, (2, -1, *token)).unbind(1)
+    scores = torch.einsum("nihw,njhw->nijh", q, k) / token.width**0.5
+    mixed = torch.einsum("nijh,njhw->nihw", scores.softmax(dim=2), v).flatten(1)
+    fused = asking + mixed @ out_weight.T + out_bias
+    return fused if build is SelfAttention else torch.cat([color, fused], dim=1)
+
+
+SHAPES = [(3, 3, 4, 1), (3, 3, 1, 4), (1, 1, 1, 1), (3, 7, 5, 2), (2, 1, 3, 3), (3, 29, 4, 1)]
+"""(color_dim, feature_dim, width, heads): those with a code of their own, odd ones, many channels."""
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("color_dim", "feature_dim", "width", "heads"), SHAPES)
+@pytest.mark.parametrize("build", [SelfAttention, CrossAttention])
+def test_values_and_every_gradient_equal_plain_pytorch(
+    build, color_dim: int, feature_dim: int, width: int, heads: int, dtype: torch.dtype
+):
+    n = 2 * 2048 + 77  # three chunks, the last with a partial block
+    fuse = build(color_dim, feature_dim, width, heads, init="xavier").to(dtype)
+    for p in fuse.parameters():
+        nn.init.normal_(p, std=0.5)
+    inputs = [torch.rand(n, color_dim, dtype=dtype), torch.randn(n, feature_dim, dtype=dtype)]
+    inputs = [x.requires_grad_() for x in inputs]
+    fused = torch.cat(fuse(*inputs), dim=1)
+    upstream = torch.randn_like(fused)
+    got = torch.autograd.grad(fused, [*inputs, *fuse.parameters()], upstream)
+
+    exact = [x.detach().double().requires_grad_() for x in (*inputs, *fuse.parameters())]
+    layers = exact[2:]
+    if build is SelfAttention:
+        inner = fuse.out.in_features
+        split = [t.split([inner, 2 * inner]) for t in layers[:2]]
+        layers = [split[0][0], split[1][0], split[0][1], split[1][1], *layers[2:]]
+    want = batched(build, fuse.token, *exact[:2], layers)
+    want_grads = torch.autograd.grad(want, exact, upstream.double())
+    for a, b in zip((fused, *got), (want, *want_grads), strict=True):
+        # Sums over n terms of size 1: relative to the largest entry.
+        error = (a.double() - b).abs().max() / b.abs().max().clamp_min(1e-30)
+        assert error < (2e-5 if dtype == torch.float32 else 1e-13)
+
+
+@pytest.mark.parametrize("token", READINGS)
+@pytest.mark.parametrize("build", [SelfAttention, CrossAttention])
+def test_gradcheck(build, token: tuple[int, int]):
+    check_gradients(build(3, 2, *token).double(), fast=False)
 
 
 @pytest.mark.parametrize("build", [SelfAttention, CrossAttention, MLP])
 def test_gradient_reaches_inputs_and_every_weight(build):
-    fuse = build(3, 2).double()
+    check_gradients(build(3, 2).double(), fast=True)
+
+
+def check_gradients(fuse: nn.Module, fast: bool) -> None:
     names = [name for name, _ in fuse.named_parameters()]
     weights = [torch.randn_like(p).requires_grad_() for p in fuse.parameters()]
     inputs = [torch.randn(2, 3).double().requires_grad_(), torch.randn(2, 2).double()]
@@ -80,11 +137,11 @@ def test_gradient_reaches_inputs_and_every_weight(build):
         return torch.cat(torch.func.functional_call(fuse, named, (color, feature)), dim=1)
 
     assert torch.autograd.gradcheck(
-        fused, (inputs[0], inputs[1].requires_grad_(), *weights), fast_mode=True
+        fused, (inputs[0], inputs[1].requires_grad_(), *weights), fast_mode=fast
     )
 
 
-@pytest.mark.parametrize("n", [0, 1, BLOCK, 3 * BLOCK + 1])
+@pytest.mark.parametrize("n", [0, 1, 16, 64, 2048, 3 * 2048 + 1])
 @pytest.mark.parametrize("build", [SelfAttention, CrossAttention, MLP])
 def test_fresh_module_changes_no_bit_and_can_still_learn(build, n: int):
     fuse = build(3, 5)
@@ -120,7 +177,7 @@ def test_gaussians_do_not_see_each_other(build):
 
     order = torch.randperm(1000)
     permuted = torch.cat(fuse(color[order], feature[order]), dim=1)
-    torch.testing.assert_close(permuted, fused[order], rtol=1e-6, atol=1e-6)
+    assert torch.equal(permuted, fused[order])
 
     color[700:] = 5.0
     assert torch.equal(torch.cat(fuse(color, feature), dim=1)[:700], fused[:700])
@@ -153,6 +210,48 @@ def test_every_bit_is_the_same_on_any_number_of_threads(build, feature_dim: int,
         torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("isa", ["base", "v3", "v4"])
+def test_every_instruction_set_gives_the_same_up_to_rounding(isa: str):
+    # In a process of its own: the choice is made once. A machine without an instruction set takes a lower one.
+    code = """if True:
+        import torch
+        from vlgs.fusion.attention import SelfAttention
+        fuse = SelfAttention(3, 4, init="xavier")
+        with torch.no_grad():
+            for i, p in enumerate(fuse.parameters()):
+                p.copy_(torch.linspace(-0.5, 0.4 + 0.1 * i, p.numel()).sin().reshape(p.shape))
+        color, feature = torch.linspace(0, 1, 303).reshape(101, 3), torch.linspace(-2, 2, 404).reshape(101, 4)
+        color.requires_grad_()
+        fused = torch.cat(fuse(color, feature), dim=1)
+        grads = torch.autograd.grad(fused.square().sum(), [color, *fuse.parameters()])
+        print(*(float(t.double().square().sum()) for t in (fused, *grads)))
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"VLGS_ISA": isa},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    fuse = SelfAttention(3, 4, init="xavier").double()
+    with torch.no_grad():
+        for i, p in enumerate(fuse.parameters()):
+            ramp = torch.linspace(-0.5, 0.4 + 0.1 * i, p.numel()).sin()
+            p.copy_(ramp.reshape(p.shape))
+    color = torch.linspace(0, 1, 303).reshape(101, 3).double().requires_grad_()
+    feature = torch.linspace(-2, 2, 404).reshape(101, 4).double()
+    inner = fuse.out.in_features
+    (w0, w1), (b0, b1) = (t.split([inner, 2 * inner]) for t in (fuse.qkv.weight, fuse.qkv.bias))
+    layers = [w0, b0, w1, b1, fuse.out.weight, fuse.out.bias]
+    fused = batched(SelfAttention, fuse.token, color, feature, layers)
+    grads = torch.autograd.grad(fused.square().sum(), [color, *fuse.parameters()])
+    want = [float(t.detach().square().sum()) for t in (fused, *grads)]
+    got = [float(word) for word in done.stdout.split()]
+    assert got == pytest.approx(want, rel=1e-4)
+
+
+def test_wrong_dtype_is_refused():
+    with pytest.raises(ValueError, match="color must be float32 or float64 like the weights"):
+        SelfAttention(3, 3)(torch.rand(2, 3).double(), torch.rand(2, 3))
 
 
 @pytest.mark.parametrize(("width", "heads"), [(4, 1), (1, 4)])

@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from vlgs.gaussians import rgb_to_sh, sh_to_rgb, view_color_residual
+from vlgs.gaussians import rgb_to_sh, sh_to_rgb, view_color
 
 
 def directions(n: int, seed: int = 0) -> torch.Tensor:
@@ -10,6 +10,15 @@ def directions(n: int, seed: int = 0) -> torch.Tensor:
     return torch.nn.functional.normalize(
         torch.randn(n, 3, generator=generator, dtype=torch.float64), dim=1
     )
+
+
+EYE = torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64)
+
+
+def view_color_residual(coefficients: torch.Tensor, toward: torch.Tensor, degree: int):
+    """What the harmonics add to a colour that is bright enough for nothing to be clamped."""
+    color = torch.full_like(toward, 100.0)
+    return view_color(color, coefficients, EYE + 2.5 * toward, EYE, degree) - color
 
 
 def real_harmonics(toward: torch.Tensor, degree: int) -> torch.Tensor:
@@ -31,7 +40,7 @@ def test_residual_matches_scipys_harmonics(degree: int):
     coefficients = torch.randn(50, (degree + 1) ** 2 - 1, 3, dtype=torch.float64)
     want = torch.einsum("ns,nsc->nc", real_harmonics(toward, degree), coefficients)
     torch.testing.assert_close(
-        view_color_residual(coefficients, toward, degree), want, rtol=1e-12, atol=1e-12
+        view_color_residual(coefficients, toward, degree), want, rtol=1e-12, atol=1e-12 * 100
     )
 
 
@@ -52,19 +61,49 @@ def test_degrees_above_the_active_one_are_not_read():
 
 
 def test_degree_zero_adds_nothing():
-    assert view_color_residual(torch.zeros(4, 0, 3), torch.rand(4, 3), 0).eq(0).all()
+    assert view_color_residual(torch.zeros(4, 0, 3).double(), directions(4), 0).eq(0).all()
 
 
 def test_no_gaussians():
-    assert view_color_residual(torch.zeros(0, 15, 3), torch.zeros(0, 3), 3).shape == (0, 3)
+    assert view_color_residual(
+        torch.zeros(0, 15, 3).double(), torch.zeros(0, 3).double(), 3
+    ).shape == (0, 3)
 
 
-def test_gradients_match_finite_differences():
-    coefficients = torch.randn(3, 15, 3, dtype=torch.float64, requires_grad=True)
-    toward = directions(3).requires_grad_()
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradients_match_finite_differences(degree: int):
+    # Colours well on either side of the clamp.
+    color = torch.tensor([[9.0, -9.0, 9.0]]).double().expand(4, 3).clone().requires_grad_()
+    coefficients = torch.randn(4, 15, 3, dtype=torch.float64, requires_grad=True)
+    means = (EYE + 1.5 * directions(4)).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda c, d: view_color_residual(c, d, 3), (coefficients, toward)
+        lambda *leaves: view_color(*leaves, EYE, degree),
+        (color, coefficients, means) if degree else (color, coefficients.detach(), means.detach()),
     )
+
+
+def test_a_gaussian_at_the_eye_has_finite_colour_and_gradient():
+    means = EYE.clone()[None].requires_grad_()
+    color = view_color(torch.ones(1, 3).double(), torch.randn(1, 15, 3).double(), means, EYE, 3)
+    color.sum().backward()
+    assert color.isfinite().all()
+    assert means.grad is not None
+    assert means.grad.isfinite().all()
+
+
+def test_gradients_are_the_same_bits_on_any_number_of_threads():
+    leaves = [torch.randn(9001, 3), torch.randn(9001, 15, 3), torch.randn(9001, 3)]
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            inputs = [leaf.clone().requires_grad_() for leaf in leaves]
+            out = view_color(*inputs, EYE.float(), 3)
+            results.append([out, *torch.autograd.grad(out.square().sum(), inputs)])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 @pytest.mark.parametrize(

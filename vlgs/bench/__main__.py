@@ -3,8 +3,11 @@
 import argparse
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
+from vlgs.bench.iteration import SIZES as ITERATIONS
+from vlgs.bench.iteration import measure_iteration, show_iterations
 from vlgs.bench.kernel import SIZES, measure_kernel, show_table, write_csv
 from vlgs.bench.overhead import measure_overhead
 from vlgs.bench.protocols import measure_protocols, show_protocols
@@ -28,7 +31,16 @@ def main() -> None:
     protocols.add_argument("--queries", type=int, default=300)
     protocols.add_argument("--levels", type=int, default=3, help="mask levels")
     protocols.add_argument("--size", type=int, nargs=2, default=(986, 728), metavar=("W", "H"))
+    iteration = commands.add_parser("iteration", help="parts of a training iteration by CPU time")
+    iteration.add_argument("--sizes", type=int, nargs="+", default=range(len(ITERATIONS)))
+    iteration.add_argument("--iterations", type=int, default=20)
+    iteration.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
+    if args.command == "iteration":
+        torch.set_num_threads(args.threads)
+        measured = [(ITERATIONS[i], measure_iteration(ITERATIONS[i], args.iterations)) for i in args.sizes]
+        Console().print(show_iterations(measured))
+        return
     if args.command == "protocols":
         costs = measure_protocols(args.queries, args.levels, *args.size)
         Console().print(show_protocols(costs))

@@ -1,70 +1,26 @@
-"""Fusion by attention over the channels of one Gaussian.
+"""Fusion by attention over the channels of one Gaussian; csrc/attention.cpp computes it, both ways."""
 
-Everything between the linear layers is laid out ``[block, channel, ..., Gaussian]``: Gaussians are many and channels few, so
-that each product below is one pass over contiguous memory. That takes a third of the time of 6 x 6 matrix products
-batched over Gaussians.
-"""
-
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from vlgs import _csrc
 from vlgs.fusion import require_channels
-from vlgs.fusion.blocks import from_blocks, linear, to_blocks
 
 MAX_CHANNELS = 64
-"""Scores take ``channels^2 * heads`` numbers per Gaussian: at 64 channels 1.6 GB for 100 000 Gaussians in float32."""
+"""A Gaussian costs ``channels^2 * heads * width`` operations, and the layers hold as many weights."""
 
 Init = Literal["zero", "xavier"]
 
 
-def channel_attention(
-    query: Float[Tensor, "b dq heads width m"],
-    key: Float[Tensor, "b dk heads width m"],
-    value: Float[Tensor, "b dk heads width m"],
-) -> Float[Tensor, "b dq heads width m"]:
-    """``softmax(Q K^T / sqrt(width)) V`` inside each of b x m Gaussians, the softmax over keys (Eq. attention)."""
-    return _ChannelAttention.apply(query * query.shape[3] ** -0.5, key, value)  # pyright: ignore[reportReturnType]
+class Token(NamedTuple):
+    """What every channel becomes."""
 
-
-class _ChannelAttention(torch.autograd.Function):
-    """Attention with its derivative in closed form: half the passes over memory of what autograd would record."""
-
-    @staticmethod
-    def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        shares = _contract(query[:, :, None], key[:, None], 4)  # [b, dq, dk, heads, m]
-        # Not `torch.softmax`, whose last bit depends on the number of threads. Less the maximum, no finite score overflows.
-        shares -= shares.amax(dim=2, keepdim=True)
-        shares.exp_()
-        shares /= shares.sum(dim=2, keepdim=True)
-        ctx.save_for_backward(query, key, value, shares)
-        return _contract(shares[..., None, :], value[:, None], 2)
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] (the decorator is untyped)
-        ctx: Any, *grads: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        query, key, value, shares = ctx.saved_tensors
-        d_out = grads[0][:, :, None]  # [b, dq, 1, heads, width, m]
-        d_scores = _contract(d_out, value[:, None], 4)
-        d_scores -= (d_scores * shares).sum(dim=2, keepdim=True)
-        d_scores *= shares
-        d_query = _contract(d_scores[..., None, :], key[:, None], 2)
-        d_key = _contract(d_scores[..., None, :], query[:, :, None], 1)
-        return d_query, d_key, _contract(shares[..., None, :], d_out, 1)
-
-
-def _contract(left: Tensor, right: Tensor, dim: int) -> Tensor:
-    """``(left * right).sum(dim)`` without the product in memory."""
-    pairs = list(zip(left.unbind(dim), right.unbind(dim), strict=True))
-    total = pairs[0][0] * pairs[0][1]
-    for a, b in pairs[1:]:
-        total.addcmul_(a, b)
-    return total
+    heads: int
+    width: int
 
 
 class SelfAttention(nn.Module):
@@ -102,7 +58,7 @@ class SelfAttention(nn.Module):
         super().__init__()
         _require_sizes("SelfAttention", color_dim, feature_dim, width, heads)
         self.widths = (color_dim, feature_dim)
-        self.token = (sum(self.widths), heads, width)
+        self.token = Token(heads, width)
         channels, inner = sum(self.widths), sum(self.widths) * heads * width
         self.qkv = nn.Linear(channels, 3 * inner)
         self.out = nn.Linear(inner, channels)
@@ -113,11 +69,11 @@ class SelfAttention(nn.Module):
     ) -> tuple[Float[Tensor, "n dc"], Float[Tensor, "n df"]]:
         """Fuse n Gaussians at once; see `vlgs.fusion.Fusion`."""
         require_channels("SelfAttention", color, feature, self.widths)
-        x = to_blocks(torch.cat([color, feature], dim=-1))
-        q, k, v = linear(self.qkv, x).unflatten(1, (3, *self.token)).unbind(1)
-        mixed = linear(self.out, channel_attention(q, k, v).flatten(1, 3))
-        d_color, d_feature = from_blocks(mixed, len(color)).split(self.widths, dim=-1)
-        return color + d_color, feature + d_feature
+        inner = self.out.in_features
+        weights = self.qkv.weight.split([inner, 2 * inner])
+        biases = self.qkv.bias.split([inner, 2 * inner])
+        layers = (weights[0], biases[0], weights[1], biases[1], self.out.weight, self.out.bias)
+        return _attend("SelfAttention", color, feature, self.token, layers)
 
 
 class CrossAttention(nn.Module):
@@ -143,7 +99,7 @@ class CrossAttention(nn.Module):
         super().__init__()
         _require_sizes("CrossAttention", color_dim, feature_dim, width, heads)
         self.widths = (color_dim, feature_dim)
-        self.token = (heads, width)
+        self.token = Token(heads, width)
         self.query = nn.Linear(feature_dim, feature_dim * heads * width)
         self.key_value = nn.Linear(color_dim, 2 * color_dim * heads * width)
         self.out = nn.Linear(feature_dim * heads * width, feature_dim)
@@ -154,12 +110,57 @@ class CrossAttention(nn.Module):
     ) -> tuple[Float[Tensor, "n dc"], Float[Tensor, "n df"]]:
         """Fuse n Gaussians at once; see `vlgs.fusion.Fusion`."""
         require_channels("CrossAttention", color, feature, self.widths)
-        color_dim, feature_dim = self.widths
-        tokens = to_blocks(color)
-        q = linear(self.query, to_blocks(feature)).unflatten(1, (feature_dim, *self.token))
-        k, v = linear(self.key_value, tokens).unflatten(1, (2, color_dim, *self.token)).unbind(1)
-        mixed = linear(self.out, channel_attention(q, k, v).flatten(1, 3))
-        return color, feature + from_blocks(mixed, len(feature))
+        pairs = [(m.weight, m.bias) for m in (self.query, self.key_value, self.out)]
+        layers = tuple(tensor for pair in pairs for tensor in pair)
+        return color, _attend("CrossAttention", color, feature, self.token, layers)[1]
+
+
+def _attend(
+    who: str, color: Tensor, feature: Tensor, token: Token, layers: tuple[Tensor, ...]
+) -> tuple[Tensor, Tensor]:
+    """Fused colour and language; the layers are weight and bias of queries, keys and values, and output."""
+    kind = layers[0].dtype
+    for name, tensor in (("color", color), ("feature", feature)):
+        if tensor.dtype != kind or kind not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"{who}: {name} must be float32 or float64 like the weights ({kind}), got {tensor.dtype}"
+            )
+    if len(color) != len(feature):
+        raise ValueError(f"{who}: feature must have {len(color)} rows, got {len(feature)}")
+    mixes_color = who == "SelfAttention"
+    fused = cast(tuple[Tensor, ...], _Attention.apply(token, mixes_color, color, feature, *layers))
+    return (fused[0], fused[1]) if mixes_color else (color, fused[0])
+
+
+class _Attention(torch.autograd.Function):
+    """(fused colour, fused language), or the second alone in cross-attention."""
+
+    @staticmethod
+    def forward(ctx: Any, token: Token, mixes_color: bool, *tensors: Tensor):
+        tensors = tuple(t.contiguous() for t in tensors)
+        color, feature, *layers = tensors
+        out_color = torch.empty_like(color) if mixes_color else None
+        out_feature = torch.empty_like(feature)
+        threads = torch.get_num_threads()
+        _csrc.attention(
+            color, feature, layers, token.heads, token.width, mixes_color, out_color, out_feature, threads,
+        )  # fmt: skip
+        ctx.save_for_backward(*tensors)
+        ctx.token, ctx.mixes_color = token, mixes_color
+        return (out_feature,) if out_color is None else (out_color, out_feature)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        color, feature, *layers = ctx.saved_tensors
+        d_color, d_feature, *d_layers = (torch.empty_like(t) for t in ctx.saved_tensors)
+        *d_out_color, d_out_feature = (d.contiguous() for d in grad_outputs)
+        _csrc.attention_backward(
+            color, feature, layers, ctx.token.heads, ctx.token.width, ctx.mixes_color,
+            d_out_color[0] if d_out_color else None,
+            d_out_feature, d_color, d_feature, d_layers, torch.get_num_threads(),
+        )  # fmt: skip
+        return (None, None, d_color, d_feature, *d_layers)
 
 
 def _require_sizes(who: str, color_dim: int, feature_dim: int, width: int, heads: int) -> None:
@@ -170,7 +171,7 @@ def _require_sizes(who: str, color_dim: int, feature_dim: int, width: int, heads
         )
     if color_dim + feature_dim > MAX_CHANNELS:
         raise ValueError(
-            f"{who}: color_dim + feature_dim must be <= {MAX_CHANNELS}, because memory grows with its square (use "
+            f"{who}: color_dim + feature_dim must be <= {MAX_CHANNELS}, because time grows with its square (use "
             f"codec=autoencoder, or fusion=mlp or none), got {color_dim} + {feature_dim}"
         )
 

@@ -5,7 +5,7 @@ from vlgs.gaussians.densify import DensifyReport, DensifyState, densify, reset_o
 from vlgs.gaussians.init import initialise
 from vlgs.gaussians.parameters import PARAMETERS, activate
 from vlgs.gaussians.ply import read_ply, write_ply
-from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color_residual
+from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color
 
 __all__ = [
     "PARAMETERS",
@@ -20,6 +20,6 @@ __all__ = [
     "reset_opacity",
     "rgb_to_sh",
     "sh_to_rgb",
-    "view_color_residual",
+    "view_color",
     "write_ply",
 ]

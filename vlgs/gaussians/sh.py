@@ -1,21 +1,16 @@
 """Colour as real spherical harmonics, with the signs, order and constants of 3DGS."""
 
 from math import pi, sqrt
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from vlgs import _csrc
 
 SH_C0 = 0.5 / sqrt(pi)
-_C1 = sqrt(3 / (4 * pi))
-_C2 = (sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi)), sqrt(15 / (16 * pi)))
-_C3 = (
-    sqrt(35 / (32 * pi)),
-    sqrt(105 / (4 * pi)),
-    sqrt(21 / (32 * pi)),
-    sqrt(7 / (16 * pi)),
-    sqrt(105 / (16 * pi)),
-)
 
 
 def sh_to_rgb(sh0: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -28,20 +23,26 @@ def rgb_to_sh(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     return (rgb - 0.5) / SH_C0
 
 
-def view_color_residual(
-    shN: Float[Tensor, "n s 3"], directions: Float[Tensor, "n 3"], degree: int
+def view_color(
+    color: Float[Tensor, "n 3"],
+    shN: Float[Tensor, "n s 3"],
+    means: Float[Tensor, "n 3"],
+    eye: Float[Tensor, " 3"],
+    degree: int,
 ) -> Float[Tensor, "n 3"]:
-    """View-dependent part of the colour: the sum over degrees 1 to `degree` (``colour=rgb_dc``, systems.md D.7).
+    """Colour seen from a point: `color` plus the sum over degrees 1 to `degree`, clamped at 0 (``colour=rgb_dc``, systems.md D.7).
 
-    It is added to the (fused) colour of `sh_to_rgb`; the sum is clamped at 0 afterwards, not here.
+    As in 3DGS the direction reaches the gradient of `means`: the colour of a Gaussian depends on where it is seen from.
 
     Args:
+        color: The (fused) colour of `sh_to_rgb`.
         shN: Coefficients of degrees 1, 2, ...; those above `degree` are not read.
-        directions: Unit vectors from the camera centre to the Gaussians, in world axes.
+        means: World units.
+        eye: Camera centre, world units; no gradient is formed.
         degree: Highest degree in use, 0 to 3.
 
     Raises:
-        ValueError: If `degree` is outside 0 to 3 or `shN` has too few coefficients.
+        ValueError: If `degree` is outside 0 to 3, `shN` has too few coefficients, or dtypes differ.
     """
     if degree not in range(4):
         raise ValueError(f"sh: degree must be 0, 1, 2 or 3, got {degree}")
@@ -51,33 +52,36 @@ def view_color_residual(
             f"sh: shN must have at least {needed} coefficients for degree {degree}, got {shN.shape[1]}"
         )
     if degree == 0:
-        return torch.zeros_like(directions)
-    basis = torch.stack(_basis(directions, degree), dim=1)  # [n, s]
-    return torch.einsum("ns,nsc->nc", basis, shN[:, :needed])
+        return color.clamp_min(0.0)
+    if color.dtype not in (torch.float32, torch.float64) or not (
+        color.dtype == shN.dtype == means.dtype
+    ):
+        raise ValueError(
+            "sh: color, shN and means must be float32 or float64 alike, "
+            f"got {color.dtype}, {shN.dtype}, {means.dtype}"
+        )
+    return cast(Tensor, _ViewColor.apply(color, shN, means, eye.tolist(), degree))
 
 
-def _basis(directions: Float[Tensor, "n 3"], degree: int) -> list[Tensor]:
-    x, y, z = directions.unbind(-1)
-    values = [-_C1 * y, _C1 * z, -_C1 * x]
-    if degree == 1:
-        return values
-    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-    values += [
-        _C2[0] * xy,
-        -_C2[0] * yz,
-        _C2[1] * (2 * zz - xx - yy),
-        -_C2[0] * xz,
-        _C2[2] * (xx - yy),
-    ]
-    if degree == 2:
-        return values
-    return [
-        *values,
-        -_C3[0] * y * (3 * xx - yy),
-        _C3[1] * xy * z,
-        -_C3[2] * y * (4 * zz - xx - yy),
-        _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-        -_C3[2] * x * (4 * zz - xx - yy),
-        _C3[4] * z * (xx - yy),
-        -_C3[0] * x * (xx - 3 * yy),
-    ]
+class _ViewColor(torch.autograd.Function):
+    """`view_color` of degree 1 to 3, by csrc/view_color.cpp."""
+
+    @staticmethod
+    def forward(ctx: Any, color: Tensor, shN: Tensor, means: Tensor, eye: list[float], degree: int):
+        tensors = color.contiguous(), shN.contiguous(), means.contiguous()
+        out = torch.empty_like(tensors[0])
+        _csrc.view_color(*tensors, eye, degree, out, torch.get_num_threads())
+        ctx.save_for_backward(*tensors)
+        ctx.eye, ctx.degree = eye, degree
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_out: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        color, shN, means = ctx.saved_tensors
+        d_color, d_shN, d_means = (torch.empty_like(t) for t in ctx.saved_tensors)
+        _csrc.view_color_backward(
+            color, shN, means, ctx.eye, ctx.degree, d_out.contiguous(), d_color, d_shN, d_means,
+            torch.get_num_threads(),
+        )  # fmt: skip
+        return d_color, d_shN, d_means, None, None

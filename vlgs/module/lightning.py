@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vlgs.blend import ViewBlend, blend_camera, blend_targets
+from vlgs.data.cache import PixelCache
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import scene_extent
 from vlgs.losses import Losses, view_similarity
@@ -17,10 +18,13 @@ from vlgs.module.settings import TrainerConfig
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
+TARGET_BYTES = 512 << 20
+"""Images and code maps kept as float32 for the losses: all views of a small scene, the latest ones of a large one."""
+
 
 @dataclass(frozen=True)
 class Target:
-    """What one training view should look like."""
+    """What one training view should look like; its tensors are shared between iterations."""
 
     view: View
     image: Float[Tensor, "h w 3"]
@@ -97,6 +101,7 @@ class VLGSModule(L.LightningModule):
         self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
+        self.target_cache = PixelCache(TARGET_BYTES)
         self.optimizer = self._make_optimizer()
         self.densify_state = DensifyState.zeros(model.count)
         self.next_step = 0
@@ -139,21 +144,21 @@ class VLGSModule(L.LightningModule):
 
     def target(self, index: int) -> Target:
         """Image, code map and mask of a training view."""
-        view = self.scene.train[index]
-        image = view.read_image().to(torch.float32).div_(255.0)
+        view, kept = self.scene.train[index], self.target_cache
+        image = kept.get((index, "image"), lambda: view.read_image().to(torch.float32).div_(255.0))
         if view.read_masks is None or not self.has_language:
             return Target(view, image, None, None)
-        rows = view.read_masks()
+        read = view.read_masks
         # Row -1, "no mask", takes the zero code that stands last.
-        return Target(view, image, self.mask_codes[rows.long()], rows >= 0)
+        codes = kept.get((index, "codes"), lambda: self.mask_codes[read().long()])
+        return Target(view, image, codes, kept.get((index, "valid"), lambda: read() >= 0))
 
     def similarity(self, first: int, second: int) -> float:
         """SSIM(I1, I2), clamped at 0, computed once per pair."""
         pair = (min(first, second), max(first, second))
         known = self.skips.similarities
         if pair not in known:
-            images = [self.scene.train[i].read_image().to(torch.float32) / 255.0 for i in pair]
-            known[pair] = view_similarity(*images)
+            known[pair] = view_similarity(*(self.target(i).image for i in pair))
         return known[pair]
 
     def _encode_masks(self) -> Float[Tensor, "m d"]:

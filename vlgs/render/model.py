@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vlgs.codec import Codec
 from vlgs.fusion import Fusion
 from vlgs.gaussians.parameters import activate
-from vlgs.gaussians.sh import sh_to_rgb, view_color_residual
+from vlgs.gaussians.sh import sh_to_rgb, view_color
 from vlgs.geometry import camera_center
 from vlgs.indicator import Indicator
 from vlgs.render.rasterize import rasterize
@@ -129,14 +128,8 @@ class SplatModel(nn.Module):
         return self._rasterize(gaussians, [ChannelGroup(values, weight)], camera).images[0]
 
     def _view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
-        if self.sh_degree == 0:
-            return fused.color.clamp_min(0.0)
-        # As in 3DGS the direction carries no gradient of its own into the position's screen statistics, but it does
-        # reach `means`: the colour of a Gaussian depends on where it is seen from.
-        offsets = fused.gaussians.means - camera_center(camera.viewmat)
-        directions = torch.nn.functional.normalize(offsets, dim=-1, eps=1e-8)
-        residual = view_color_residual(fused.gaussians.shN, directions, self.sh_degree)
-        return (fused.color + residual).clamp_min(0.0)
+        gaussians, eye = fused.gaussians, camera_center(camera.viewmat)
+        return view_color(fused.color, gaussians.shN, gaussians.means, eye, self.sh_degree)
 
     def _rasterize(self, gaussians: Gaussians, groups: list[ChannelGroup], camera: Camera):
         return rasterize(

@@ -1,0 +1,175 @@
+"""Where the CPU time of a training iteration goes, by part, at two sizes."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from statistics import fmean
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from hydra import compose, initialize_config_dir
+from rich.table import Table
+
+from vlgs.config import CONF, instantiate
+from vlgs.fusion import attention
+from vlgs.gaussians import sh
+from vlgs.module.build import Parts, build_module
+from vlgs.module.lightning import VLGSModule
+from vlgs.render import cpu
+
+KERNELS = ("project", "blend", "fusion", "Adam")
+"""Parts that are not overhead: everything else is called the rest."""
+
+OVERRIDES = (
+    "data.test_views=2",
+    "codec.training.steps=20",
+    "codec.cache_dir=null",
+    "gaussians.densify.stop=0",
+)
+
+
+@dataclass(frozen=True)
+class IterationSize:
+    """One row of the table: a default run that differs in these values."""
+
+    gaussians: int
+    width: int
+    height: int
+    views: int
+    sh_degree: int
+
+
+SIZES = (IterationSize(5_000, 200, 150, 40, 0), IterationSize(100_000, 986, 728, 4, 3))
+
+
+class Stopwatch:
+    """CPU seconds of all threads per part; what a part calls counts for the inner one only."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, float] = defaultdict(float)
+        self._open: list[str] = []
+        self._since = 0.0
+
+    def around(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """The call, timed."""
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self._book()
+            self._open.append(part)
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self._book()
+                self._open.pop()
+
+        return timed
+
+    def _book(self) -> None:
+        now = time.process_time()
+        if self._open:
+            self.parts[self._open[-1]] += now - self._since
+        self._since = now
+
+
+def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
+    """Mean CPU milliseconds of every part of an iteration, after three that are not counted.
+
+    An iteration is `VLGSModule.training_step` and the statistics of densification. Keys are `KERNELS`, the parts of the
+    rest, and ``total``.
+    """
+    watch = Stopwatch()
+    rows: list[dict[str, float]] = []
+    with ExitStack() as patches:
+        module = _module(size)
+        for index in range(size.views):
+            module.target(index)  # as after the first epoch
+        for owner, name, part in _timed(module):
+            call = watch.around(part, getattr(owner, name))
+            made = staticmethod(call) if isinstance(owner, type) else call
+            patches.enter_context(patch.object(owner, name, made))
+        first = size.sh_degree * module.settings.sh_every
+        statistics = watch.around("densification statistics", _gather_statistics)
+        step = watch.around("step, what is left", module.training_step)
+        for index in range(first, first + iterations + 3):
+            watch.parts.clear()
+            step(index, index)
+            statistics(module)
+            rows.append({**watch.parts, "total": sum(watch.parts.values())})
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: 1e3 * fmean(row.get(name, 0.0) for row in rows[3:]) for name in names}
+
+
+def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
+    """What is timed, and as which part."""
+    functions = {
+        "project": cpu._Project,
+        "blend": cpu._Blend,
+        "fusion": attention._Attention,
+        "spherical harmonics": sh._ViewColor,
+    }
+    for part, function in functions.items():
+        yield function, "forward", part
+        yield function, "backward", part
+    yield module.optimizer, "step", "Adam"
+    yield module.optimizer, "zero_grad", "zero_grad"
+    yield module, "target", "targets"
+    yield module, "similarity", "similarity of the views"
+    yield module, "_backward", "backward of the rest"
+    yield module, "_refuse_non_finite_gradients", "finite check"
+    yield module, "_color_loss", "losses, forward"
+    yield module, "_language_loss", "losses, forward"
+    yield module, "_color_mse", "PSNR of the step"
+    yield module, "_blended_loss", "blended view, forward"
+    yield module.model, "fuse", "activation, forward"
+    yield module.model, "_view_color", "spherical harmonics"
+    yield module.model, "render", "render, what is left"
+
+
+def _gather_statistics(module: VLGSModule) -> None:
+    for gradient, render in zip(module.screen_gradients, module.report.renders, strict=True):
+        height, width = render.alpha_color.shape if render.alpha_color is not None else (1, 1)
+        module.densify_state.accumulate(gradient, render.visible, width, height)
+
+
+def share_of_rest(parts: dict[str, float]) -> float:
+    """Share of an iteration that lies outside `KERNELS`."""
+    return 1 - sum(parts.get(name, 0.0) for name in KERNELS) / parts["total"]
+
+
+def show_iterations(measured: list[tuple[IterationSize, dict[str, float]]]) -> Table:
+    """One column per size: milliseconds and share of every part."""
+    table = Table(title=f"CPU time of a training iteration, {torch.get_num_threads()} threads")
+    table.add_column("part")
+    for size, _ in measured:
+        name = f"{size.gaussians} at {size.width}x{size.height}, SH {size.sh_degree}"
+        table.add_column(name, justify="right")
+    names = dict.fromkeys([*KERNELS, *(name for _, parts in measured for name in parts)])
+    for name in names:
+        if name != "total":
+            shown = [
+                f"{parts.get(name, 0.0):.2f} ms {parts.get(name, 0.0) / parts['total']:6.1%}"
+                for _, parts in measured
+            ]
+            table.add_row(name, *shown)
+    rest = [f"{share_of_rest(p) * p['total']:.2f} ms {share_of_rest(p):6.1%}" for _, p in measured]
+    table.add_section()
+    table.add_row("outside " + ", ".join(KERNELS), *rest)
+    table.add_row("whole iteration", *(f"{parts['total']:.2f} ms 100.0%" for _, parts in measured))
+    return table
+
+
+def _module(size: IterationSize) -> VLGSModule:
+    overrides = [
+        *OVERRIDES,
+        f"data.train_views={size.views}",
+        f"data.width={size.width}",
+        f"data.height={size.height}",
+        f"data.points={size.gaussians}",
+    ]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=overrides)
+    parts = Parts(**{part.name: instantiate(config[part.name]) for part in fields(Parts)})
+    return build_module(instantiate(config.data), parts, config.seed)
