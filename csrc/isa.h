@@ -24,6 +24,17 @@ void blend(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
 template <class T>
 bool blend_backward(const Pass<T> &, int64_t tile, T *scratch, T *slots);
 
+template <class T>
+void freeze(const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights);
+template <class T>
+void frozen_blend(const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
+                  const T *values, int64_t channels, T *scratch, T *image);
+template <class T>
+void frozen_upstream(const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs);
+template <class T>
+void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
+                     const T *upstream, int64_t channels, T *d_value);
+
 extern const Kernels<float> kFloat;
 extern const Kernels<double> kDouble;
 

@@ -130,6 +130,15 @@ struct Kernels {
   int64_t (*backward_scratch)(const Pass<T> &, int64_t list_length);
   void (*blend)(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
   bool (*blend_backward)(const Pass<T> &, int64_t tile, T *scratch, T *slots);
+  // Weights of the first chain of one tile: entries per block, and if `ids` is given the entries themselves.
+  void (*freeze)(const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights);
+  // One block of pixels of an image; scratch [channels, kPixels].
+  void (*frozen_blend)(const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
+                       const T *values, int64_t channels, T *scratch, T *image);
+  // A block of pixels as [channels, kPixels], then the gradient of one Gaussian's values over its entries.
+  void (*frozen_upstream)(const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs);
+  void (*frozen_backward)(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
+                          const T *upstream, int64_t channels, T *d_value);
 };
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.

@@ -49,6 +49,9 @@ class Blend {
 
   void backward(const BlendGrads<T> &, int threads) const;
 
+  int64_t rows() const { return n_; }
+  const Pass<T> &pass() const { return stages_[0].pass; }  // of the first chains; valid while this lives
+
  private:
   // Chains [first_chain, first_chain + pass.chains) and their parts.
   struct Stage {

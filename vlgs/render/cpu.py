@@ -120,6 +120,32 @@ def _kernel_camera(camera: Camera, config: RasterConfig) -> _csrc.Camera:
     return _csrc.Camera(viewmat, [fx, fy, cx, cy], slopes, config.near, config.eps2d)
 
 
+def freeze(
+    splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig
+) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, Tensor]:
+    """A picture of nothing but weights, as the kernel holds it, with `visible` and the accumulated weight."""
+    nothing = ChannelGroup(weight.new_zeros(len(weight), 1), weight.contiguous())
+    layout, weights = _lay_out([nothing], camera, config)
+    picture, visible, alphas, _ = _draw(layout, splats, weights, [nothing.values])
+    return picture, visible, alphas[0]
+
+
+def _draw(
+    layout: _Layout, splats: Splats, weights: Sequence[Tensor], values: Sequence[Tensor]
+) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, list[Tensor], list[Tensor]]:
+    """The kernel's picture with (visible, alpha per chain, image per group)."""
+    depth, size = splats.depth, (layout.height, layout.width)
+    visible = torch.empty(len(depth), dtype=torch.bool)
+    alphas = [depth.new_empty(size) for _ in weights]
+    images = [depth.new_empty(*size, v.shape[1]) for v in values]
+    kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
+    picture = kernel(
+        *splats, weights, layout.shape_grads, values, layout.order,
+        layout.chain_of, layout.config, images, alphas, visible, torch.get_num_threads(),
+    )  # fmt: skip
+    return picture, visible, alphas, images
+
+
 class _Project(torch.autograd.Function):
     """Gaussians to the fields of `Splats`."""
 
@@ -156,15 +182,8 @@ class _Blend(torch.autograd.Function):
         num_chains = len(layout.shape_grads)
         rest = tuple(t.contiguous() for t in rest)
         weights, values = rest[:num_chains], rest[num_chains:]
-        size = (layout.height, layout.width)
-        visible = torch.empty(len(depth), dtype=torch.bool)
-        alphas = [depth.new_empty(size) for _ in weights]
-        images = [depth.new_empty(*size, v.shape[1]) for v in values]
-        kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
-        ctx.blend = kernel(
-            mean2d, ellipse, depth, weights, layout.shape_grads, values, layout.order,
-            layout.chain_of, layout.config, images, alphas, visible, torch.get_num_threads(),
-        )  # fmt: skip
+        splats = Splats(mean2d, ellipse, depth)
+        ctx.blend, visible, alphas, images = _draw(layout, splats, weights, values)
         ctx.save_for_backward(mean2d, ellipse, *rest)
         ctx.num_chains = num_chains
         ctx.set_materialize_grads(False)
