@@ -122,6 +122,11 @@ SKIPS: tuple[Skip, ...] = (
         "autograd",
     ),
     _always(
+        "frozen_color", "same bits",
+        "With frozen weights the colour image of a view is kept too where nothing that it depends on is trained.",
+        "vlgs",
+    ),
+    _always(
         "unused_modality", "same bits",
         "A blended view renders language alone; a scene or view without language renders colour alone, unfused.",
         "Eq. overall",
