@@ -31,17 +31,13 @@ template <class T>
 void Frozen<T>::keep(const Blend<T> &picture, int threads) {
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y, entries = block_begin_.back();
   ids_ = Buffer<uint32_t>(entries);
-  blocks_ = Buffer<uint32_t>(entries);
   weights_ = Buffer<T>(entries * kPixels);
-  entries_ = Buffer<uint32_t>(entries);
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     int64_t counts[kBlocks];
     const int64_t *begin = block_begin_.data() + tile * kBlocks;
     kernels<T>().freeze(picture.pass(), tile, counts, ids_.data() + begin[0],
                         weights_.data() + begin[0] * kPixels);
-    for (int b = 0; b < kBlocks; ++b)
-      std::fill(blocks_.data() + begin[b], blocks_.data() + begin[b + 1], uint32_t(tile * kBlocks + b));
   }
   index_by_gaussian();
   kept_ = true;
@@ -54,7 +50,14 @@ void Frozen<T>::index_by_gaussian() {
   int64_t place = 0;
   for (int64_t &count : row_begin_) place += std::exchange(count, place);
   std::vector<int64_t> next(row_begin_);
-  for (int64_t k = 0; k < entries; ++k) entries_[next[ids_[k]]++] = uint32_t(k);
+  entries_ = Buffer<uint32_t>(entries + kFrozenAhead);
+  blocks_ = Buffer<uint32_t>(entries);
+  for (size_t block = 0; block + 1 < block_begin_.size(); ++block)
+    for (int64_t k = block_begin_[block]; k < block_begin_[block + 1]; ++k) {
+      const int64_t to = next[ids_[k]]++;
+      entries_[to] = uint32_t(k), blocks_[to] = uint32_t(block);
+    }
+  std::fill(entries_.data() + entries, entries_.data() + entries + kFrozenAhead, 0u);
 }
 
 template <class T>
@@ -94,7 +97,7 @@ void Frozen<T>::backward(const T *d_image, int64_t channels, T *d_values, int th
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 64)
   for (int64_t i = 0; i < n_; ++i) {
     const int64_t begin = row_begin_[i];
-    kernel.frozen_backward(row_begin_[i + 1] - begin, entries_.data() + begin, blocks_.data(),
+    kernel.frozen_backward(row_begin_[i + 1] - begin, entries_.data() + begin, blocks_.data() + begin,
                            weights_.data(), upstream.data(), channels, d_values + i * channels);
   }
 }

@@ -32,10 +32,10 @@ class Frozen {
   bool kept_ = false;
   std::vector<int64_t> block_begin_;  // [blocks + 1] entries of a block, front to back
   Buffer<uint32_t> ids_;              // [entries] row of the Gaussian
-  Buffer<uint32_t> blocks_;           // [entries] block
   Buffer<T> weights_;                 // [entries, kPixels]
   std::vector<int64_t> row_begin_;    // [n + 1]
-  Buffer<uint32_t> entries_;          // [entries] those of a row, in the order of the blocks
+  Buffer<uint32_t> entries_;          // [entries + kFrozenAhead] those of a row, in the order of the blocks
+  Buffer<uint32_t> blocks_;           // [entries] their blocks
 };
 
 }  // namespace vlgs

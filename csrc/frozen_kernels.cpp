@@ -32,8 +32,10 @@ inline void gather_channels(int64_t count, const uint32_t *entries, const uint32
   Pack<T> acc[kLanes];
   for (auto &a : acc) a = splat(T(0));
   for (int64_t j = 0; j < count; ++j) {
+    const T *ahead = weights + int64_t(entries[j + kFrozenAhead]) * kLanes;  // may be of the next Gaussian
+    for (int i = 0; i < kLanes; i += 64 / int(sizeof(T))) __builtin_prefetch(ahead + i);
     const Pack<T> weight = load(weights + int64_t(entries[j]) * kLanes);
-    const T *at = upstream + int64_t(blocks[entries[j]]) * channels * kLanes;
+    const T *at = upstream + int64_t(blocks[j]) * channels * kLanes;
     for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, load(at + k * kLanes), acc[k]);
   }
   T sums[kLanes];

@@ -16,6 +16,7 @@ constexpr int kBlocks = 16;        // blocks of a tile, and bits of a block mask
 constexpr int kPixels = 16;        // pixels of a block, row by row
 constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
 constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
+constexpr int kFrozenAhead = 16;   // entries between asking for a kept weight and using it
 constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
 
 // Exponents are in octaves: weight falls off as 2^-(u^2 + v^2) with u, v scaled by kOctaves = sqrt(log2(e) /
