@@ -7,8 +7,10 @@
 
 #include <algorithm>
 #include <optional>
+#include <string>
 
 #include "attention.h"
+#include "frozen.h"
 #include "rasterizer.h"
 #include "view_color.h"
 #include "window.h"
@@ -48,6 +50,17 @@ Camera make_camera(const std::vector<double> &viewmat, const std::vector<double>
   c.slope_low[1] = slopes[2], c.slope_high[1] = slopes[3];
   c.near = near, c.blur = blur;
   return c;
+}
+
+// Unlike a picture, a frozen view outlives the tensors that it was made from.
+template <class T, class Values, class Picture>
+void require_shapes(const Frozen<T> &frozen, const Values &values, const Picture &image) {
+  if (!frozen.kept()) throw std::invalid_argument("frozen view: weights must be kept before they are used");
+  if (int64_t(values.shape(0)) != frozen.rows() || int64_t(image.shape(0)) != frozen.height() ||
+      int64_t(image.shape(1)) != frozen.width() || image.shape(2) != values.shape(1))
+    throw std::invalid_argument("frozen view: values and image must have its rows and pixels, got " +
+                                std::to_string(values.shape(0)) + " rows, " + std::to_string(image.shape(0)) +
+                                " x " + std::to_string(image.shape(1)) + " pixels");
 }
 
 template <class T>
@@ -241,6 +254,42 @@ void bind_filter(nb::module_ &m) {
       strict("planes"), strict("taps"), strict("out"), "threads"_a);
 }
 
+template <class T>
+void bind_frozen(nb::module_ &m, const char *name) {
+  nb::class_<Frozen<T>>(m, name)
+      .def(
+          "__init__",
+          [](Frozen<T> *self, const Blend<T> &picture, int threads) {
+            nb::gil_scoped_release unlocked;
+            new (self) Frozen<T>(picture, threads);
+          },
+          "picture"_a, "threads"_a)
+      .def(
+          "keep",
+          [](Frozen<T> &self, const Blend<T> &picture, int threads) {
+            nb::gil_scoped_release unlocked;
+            self.keep(picture, threads);
+          },
+          "picture"_a, "threads"_a)
+      .def_prop_ro("bytes", &Frozen<T>::bytes)
+      .def(
+          "render",
+          [](const Frozen<T> &self, Rows<const T> values, Image<T> image, int threads) {
+            require_shapes(self, values, image);
+            nb::gil_scoped_release unlocked;
+            self.render(values.data(), int64_t(values.shape(1)), image.data(), threads);
+          },
+          strict("values"), strict("image"), "threads"_a)
+      .def(
+          "backward",
+          [](const Frozen<T> &self, Image<const T> d_image, Rows<T> d_values, int threads) {
+            require_shapes(self, d_values, d_image);
+            nb::gil_scoped_release unlocked;
+            self.backward(d_image.data(), int64_t(d_values.shape(1)), d_values.data(), threads);
+          },
+          strict("d_image"), strict("d_values"), "threads"_a);
+}
+
 }  // namespace
 }  // namespace vlgs
 
@@ -261,10 +310,12 @@ NB_MODULE(_csrc, m) {
       .def(
           "__init__",
           [](BlendConfig *self, double alpha_min, double alpha_max, double transmittance_min,
-             bool stop_before, int64_t memory_budget) {
-            new (self) BlendConfig{alpha_min, alpha_max, transmittance_min, stop_before, memory_budget};
+             bool stop_before, int64_t memory_budget, bool tile_test, bool block_masks, bool opacity_extent) {
+            new (self) BlendConfig{alpha_min,   alpha_max,     transmittance_min,
+                                   stop_before, memory_budget, {tile_test, block_masks, opacity_extent}};
           },
-          "alpha_min"_a, "alpha_max"_a, "transmittance_min"_a, "stop_before"_a, "memory_budget"_a);
+          "alpha_min"_a, "alpha_max"_a, "transmittance_min"_a, "stop_before"_a, "memory_budget"_a,
+          "tile_test"_a, "block_masks"_a, "opacity_extent"_a);
   bind_project<float>(m);
   bind_project<double>(m);
   bind_blend<float>(m, "BlendFloat");
@@ -275,4 +326,6 @@ NB_MODULE(_csrc, m) {
   bind_view_color<double>(m);
   bind_filter<float>(m);
   bind_filter<double>(m);
+  bind_frozen<float>(m, "FrozenFloat");
+  bind_frozen<double>(m, "FrozenDouble");
 }

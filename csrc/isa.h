@@ -33,6 +33,17 @@ void attention_backward(const Attention<T> &, Fused<const T *> d_out, Fused<T *>
 template <class T>
 void filter_plane(const Window<T> &, int64_t plane, T *line);
 
+template <class T>
+void freeze(const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights);
+template <class T>
+void frozen_blend(const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
+                  const T *values, int64_t channels, T *scratch, T *image);
+template <class T>
+void frozen_upstream(const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs);
+template <class T>
+void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
+                     const T *upstream, int64_t channels, T *d_value);
+
 extern const Kernels<float> kFloat;
 extern const Kernels<double> kDouble;
 

@@ -19,6 +19,7 @@ constexpr int kBlocks = 16;        // blocks of a tile, and bits of a block mask
 constexpr int kPixels = 16;        // pixels of a block, row by row
 constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
 constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
+constexpr int kFrozenAhead = 16;   // entries between asking for a kept weight and using it
 constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
 
 // Exponents are in octaves: weight falls off as 2^-(u^2 + v^2) with u, v scaled by kOctaves = sqrt(log2(e) /
@@ -133,6 +134,15 @@ struct Kernels {
   int64_t (*backward_scratch)(const Pass<T> &, int64_t list_length);
   void (*blend)(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
   bool (*blend_backward)(const Pass<T> &, int64_t tile, T *scratch, T *slots);
+  // Weights of the first chain of one tile: entries per block, and if `ids` is given the entries themselves.
+  void (*freeze)(const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights);
+  // One block of pixels of an image; scratch [channels, kPixels].
+  void (*frozen_blend)(const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
+                       const T *values, int64_t channels, T *scratch, T *image);
+  // A block of pixels as [channels, kPixels], then the gradient of one Gaussian's values over its entries.
+  void (*frozen_upstream)(const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs);
+  void (*frozen_backward)(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
+                          const T *upstream, int64_t channels, T *d_value);
   // Gaussians [begin, end); backward adds to sums over them, one per lane.
   int64_t (*attention_scratch)(const AttentionShape &);
   void (*attention)(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch);

@@ -18,6 +18,7 @@ struct BlendConfig {
   double alpha_min, alpha_max, transmittance_min;
   bool stop_before;
   int64_t memory_budget;  // bytes
+  Trim trim;
 };
 
 template <class T>
@@ -47,6 +48,9 @@ class Blend {
         const BlendConfig &, bool *visible, int threads);
 
   void backward(const BlendGrads<T> &, int threads) const;
+
+  int64_t rows() const { return n_; }
+  const Pass<T> &pass() const { return stages_[0].pass; }  // of the first chains; valid while this lives
 
  private:
   // Chains [first_chain, first_chain + pass.chains) and their parts.

@@ -103,9 +103,19 @@ def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
+    if isinstance(kept.get("gaussians"), dict):
+        kept["gaussians"] = _by_content(kept["gaussians"], "init")
     identity = {"config": kept, "data": fingerprint, "results_version": results_version}
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _by_content(group: dict[Any, Any], key: str) -> dict[Any, Any]:
+    """A group with the file that a key names replaced by what is in it; one that is missing is an error later."""
+    path = group.get(key)
+    if path is None or not Path(path).is_file():
+        return group
+    return group | {key: hashlib.blake2b(Path(path).read_bytes(), digest_size=8).hexdigest()}
 
 
 def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:

@@ -153,6 +153,7 @@ def _report(
     extra = {
         "n_gaussians": model.count,
         "train_seconds": module.train_seconds,
+        "skips": module.skips.report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         "ply_bytes": folder.ply.stat().st_size,
         "checkpoint_bytes": max(f.stat().st_size for f in folder.checkpoint.glob("*.safetensors")),

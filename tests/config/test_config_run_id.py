@@ -35,6 +35,14 @@ def test_the_id_follows_the_configuration(change: dict):
     assert run_id(config(**change), "f", 1) != run_id(config(), "f", 1)
 
 
+def test_the_id_follows_what_is_in_the_first_gaussians_not_where_they_lie(tmp_path: Path):
+    ids = []
+    for name, content in (("a.ply", b"one"), ("b.ply", b"one"), ("c.ply", b"two")):
+        (tmp_path / name).write_bytes(content)
+        ids.append(run_id(config(gaussians={"init": str(tmp_path / name)}), "f", 1))
+    assert ids[0] == ids[1] != ids[2]
+
+
 def test_the_id_follows_data_and_results_version():
     assert len({run_id(config(), "f", 1), run_id(config(), "g", 1), run_id(config(), "f", 2)}) == 3
 

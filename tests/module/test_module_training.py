@@ -177,7 +177,7 @@ def test_a_scene_without_language_trains_colour_only(tiny_scene: Scene, tmp_path
         train=tuple(replace(view, read_masks=None) for view in tiny_scene.train),
     )
     module = train(module_of(silent), tmp_path)
-    assert module.skips.blends_done == 0
+    assert module.skips.done("blended render") == 0
     assert torch.equal(
         module.model.splats["features"], torch.zeros_like(module.model.splats["features"])
     )
@@ -198,7 +198,7 @@ def test_a_blended_view_without_weight_is_not_rendered(
     tiny_scene: Scene, tmp_path: Path, blend: str
 ):
     module = train(module_of(tiny_scene, blend), tmp_path)
-    assert module.skips.blends_done == 0
+    assert module.skips.done("blended render") == 0
 
 
 def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):

@@ -99,6 +99,19 @@ def test_summary_shows_scores_reasons_and_unbroken_paths(tmp_path: Path):
     ]
 
 
+def test_summary_says_what_was_skipped(tmp_path: Path):
+    skips = {
+        "blend_zero": {"skipped": 1500, "share": 0.25, "seconds_saved": 12.34},
+        "frozen_weights": {"skipped": 7, "share": 1.0, "seconds_saved": None},
+    }
+    console = Console(width=90, record=True, file=io.StringIO())
+    print_summary(write_metrics(tmp_path / "m.json", EVALUATION, {"skips": skips}), {}, console)
+    text = console.export_text()
+    assert "skipped: blend_zero" in text
+    assert "1,500 (25.0%), saved ~12.3 s" in text
+    assert "7 (100.0%)" in text
+
+
 def test_summary_of_nothing_at_all(tmp_path: Path):
     empty = replace(EVALUATION, psnr=None, ssim=None, miou=None, per_category={}, beside={})
     console = Console(width=80, record=True, file=io.StringIO())

@@ -79,6 +79,8 @@ class GaussiansConfig:
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (systems.md D.11)."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
+    init: str | None = None
+    """A point_cloud.ply to start from, of this program or any 3DGS; None: the scene's points."""
 
     def __post_init__(self) -> None:
         if self.sh_degree not in range(4):

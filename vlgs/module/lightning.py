@@ -1,20 +1,25 @@
 """Training as one LightningModule: parameters, the step of Eq. overall, one Adam."""
 
 import math
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass
 
 import lightning as L
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from vlgs.blend import ViewBlend, blend_camera, blend_targets
+from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
+from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import scene_extent
 from vlgs.losses import Losses, view_similarity
+from vlgs.module.blended import BlendPlan, plan_blend
+from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
 from vlgs.module.sampler import PairSampler
 from vlgs.module.settings import TrainerConfig
+from vlgs.module.skips import SkipCount
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
@@ -47,17 +52,6 @@ class StepReport:
     """lambda * SSIM(I1, I2) of Eq. blend; 0 where the blended view was not rendered."""
 
 
-@dataclass
-class SkipCount:
-    """Work that an iteration did not need, and how often."""
-
-    blends_done: int = 0
-    blends_without_weight: int = 0
-    """Blended views not rendered because SSIM(I1, I2) is not positive, so that their loss is exactly zero."""
-    similarities: dict[tuple[int, int], float] = field(default_factory=dict)
-    """SSIM(I1, I2) per pair of views: constant, so computed once (systems.md D.12)."""
-
-
 class VLGSModule(L.LightningModule):
     """Two real views and one language-only blended view per iteration (Eqs. raster, blend, overall).
 
@@ -74,7 +68,7 @@ class VLGSModule(L.LightningModule):
         seed: Seed of all draws.
 
     Raises:
-        ValueError: If the scene has no training view.
+        ValueError: If the scene has no training view, or what is frozen cannot be (`vlgs.module.frozen.freeze`).
     """
 
     def __init__(
@@ -102,6 +96,7 @@ class VLGSModule(L.LightningModule):
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
         self.target_cache = PixelCache(TARGET_BYTES)
+        freeze(model, tuple(trainer_config.freeze), gaussians_config.densify.stop)
         self.optimizer = self._make_optimizer()
         self.densify_state = DensifyState.zeros(model.count)
         self.next_step = 0
@@ -109,6 +104,9 @@ class VLGSModule(L.LightningModule):
         self.report = StepReport()
         self.screen_gradients: tuple[Tensor, ...] = ()
         self.skips = SkipCount()
+        self.frozen = None
+        if trainer_config.skip.frozen_weights and set(trainer_config.freeze) >= GEOMETRY:
+            self.frozen = FrozenRenders(model, trainer_config.skip.frozen_budget, self.skips)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """The one Adam; its groups are named after the parameters."""
@@ -117,29 +115,29 @@ class VLGSModule(L.LightningModule):
     def training_step(self, step: int, batch_idx: int) -> None:
         """One iteration; `step` counts from 0 over the whole run, resumed or not."""
         self._set_schedule(step)
-        first, second = (self.target(index) for index in self.sampler.pair(step))
-        fused = self.model.fuse()
-        renders = [self._render(target, fused) for target in (first, second)]
-        targets = (first, second)
+        pair = self.sampler.pair(step)
+        first, second = targets = self.target(pair[0]), self.target(pair[1])
+        plan = None if second is first else self._plan_blend(step, first, second)
+        fused = self._fuse(targets, plan)
+        renders = [self._render(i, t, fused) for i, t in zip(pair, targets, strict=True)]
         color_losses = [self._color_loss(r, t) for r, t in zip(renders, targets, strict=True)]
         total = sum(color_losses, torch.zeros(()))
         for render, target in zip(renders, targets, strict=True):
             total = total + self._language_loss(render, target)
-        weight = 0.0
-        if second is not first:
-            blended, weight = self._blended_loss(step, first, second, fused)
-            if blended is not None:
-                total = total + blended
+        if plan is not None:
+            total = total + self._blended_loss(plan, targets, renders, fused)
         views = (first.view.name, second.view.name)
         where = f"in step {step} with views {' and '.join(views)}"
         if not torch.isfinite(total):
             raise FloatingPointError(f"train: loss must be finite, got {total.item()} {where}")
         self.optimizer.zero_grad(set_to_none=True)
-        self.screen_gradients = self._backward(total, color_losses, renders)
-        self._refuse_non_finite_gradients(where)
+        if total.requires_grad:  # nothing that is trained may be in view
+            self.screen_gradients = self._backward(total, color_losses, renders)
+        if not self.settings.skip.finite_check:
+            self._refuse_non_finite_gradients(where)
         self.optimizer.step()
         self.next_step = step + 1
-        mse = self._color_mse(renders, targets)
+        mse, weight = self._color_mse(renders, targets), 0.0 if plan is None else plan.weight
         self.report = StepReport(step, views, tuple(renders), float(total.detach()), mse, weight)
 
     def target(self, index: int) -> Target:
@@ -157,8 +155,11 @@ class VLGSModule(L.LightningModule):
         """SSIM(I1, I2), clamped at 0, computed once per pair."""
         pair = (min(first, second), max(first, second))
         known = self.skips.similarities
-        if pair not in known:
-            known[pair] = view_similarity(*(self.target(i).image for i in pair))
+        if pair in known:
+            self.skips.skip("similarity_cache")
+        else:
+            with self.skips.doing("similarity"):
+                known[pair] = view_similarity(*(self.target(i).image for i in pair))
         return known[pair]
 
     def _encode_masks(self) -> Float[Tensor, "m d"]:
@@ -174,11 +175,14 @@ class VLGSModule(L.LightningModule):
         groups = [
             {"params": [parameter], "lr": getattr(rates, name), "name": name}
             for name, parameter in self.model.splats.items()
+            if parameter.requires_grad
         ]
         if isinstance(self.model.fusion, nn.Module):
             weights = list(self.model.fusion.parameters())
             if weights:
                 groups.append({"params": weights, "lr": rates.fusion, "name": "fusion"})
+        if not groups:
+            raise ValueError("train: trainer.freeze must leave something to train, got everything")
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def _set_schedule(self, step: int) -> None:
@@ -186,10 +190,27 @@ class VLGSModule(L.LightningModule):
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.extent
         highest = {0: 0, 3: 1, 8: 2, 15: 3}[self.model.splats["shN"].shape[1]]
-        self.model.sh_degree = min(highest, step // self.settings.sh_every)
+        if "shN" in self.settings.freeze:  # as they were trained, all at once
+            self.model.sh_degree = highest
+        else:
+            self.model.sh_degree = min(highest, step // self.settings.sh_every)
 
-    def _render(self, target: Target, fused: FusedGaussians) -> ViewRender:
+    def _fuse(self, targets: tuple[Target, ...], plan: BlendPlan | None) -> FusedGaussians:
+        if not self.settings.skip.fuse_visible or isinstance(self.model.fusion, NoFusion):
+            return self.model.fuse()
+        cameras = [target.view.camera for target in targets]
+        started = time.perf_counter()
+        fused = self.model.fuse(cameras if plan is None else [*cameras, plan.camera])
+        self.skips.add("fusion", fused.rows, time.perf_counter() - started)
+        self.skips.skip("fuse_visible", self.model.count - fused.rows)
+        return fused
+
+    def _render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
         language = target.codes is not None
+        if self.frozen is not None:
+            kept = self.frozen.render(index, target.view.camera, language, fused)
+            if kept is not None:
+                return kept
         render = self.model.render(target.view.camera, language=language, fused=fused)
         if render.mean2d.requires_grad:
             render.mean2d.retain_grad()
@@ -209,6 +230,9 @@ class VLGSModule(L.LightningModule):
     ) -> tuple[Float[Tensor, "n 2"], ...]:
         """Gradients of everything; returns those of the screen positions, per view, that feed densification."""
         screen = [render.mean2d for render in renders]
+        if not all(mean2d.requires_grad for mean2d in screen):  # frozen, hence no densification
+            total.backward()
+            return ()
         if self.gaussians_config.densify_on == "rgb":
             color = torch.autograd.grad(
                 sum(color_losses, torch.zeros(())), screen, retain_graph=True
@@ -221,28 +245,46 @@ class VLGSModule(L.LightningModule):
             for mean2d in screen
         )
 
-    def _blended_loss(
-        self, step: int, first: Target, second: Target, fused: FusedGaussians
-    ) -> tuple[Tensor | None, float]:
-        """Third term of Eq. overall and its weight; None where it is not needed."""
+    def _plan_blend(self, step: int, first: Target, second: Target) -> BlendPlan | None:
+        """The blended view of an iteration; None where there is none or its loss does not count."""
         if not self.blend.active or first.codes is None or second.codes is None:
-            return None, 0.0
-        assert first.valid is not None
-        assert second.valid is not None
+            return None
         similarity = self.similarity(*self.sampler.pair(step)) if self.blend.ssim else 1.0
         weight = self.losses.blend_weight * similarity
-        if weight <= 0:
-            self.skips.blends_without_weight += 1
-            return None, 0.0
+        least = self.settings.skip.blend_weight
+        if weight <= least:
+            self.skips.skip("blend_zero" if weight <= 0 else "blend_small")
+            return None
         k = self.blend.draw(self.sampler.ratio_rng(step))
-        camera = blend_camera(first.view.camera, second.view.camera, k, self.blend)
-        codes, valid = blend_targets(
-            first.codes, first.valid, second.codes, second.valid, k, self.blend
+        cameras = first.view.camera, second.view.camera
+        return plan_blend(
+            cameras, k, similarity, weight, self.blend, self.settings.skip.blend_reuse
         )
-        feature = self.model.render(camera, color=False, fused=fused).feature
+
+    def _blended_loss(
+        self,
+        plan: BlendPlan,
+        targets: tuple[Target, Target],
+        renders: list[ViewRender],
+        fused: FusedGaussians,
+    ) -> Float[Tensor, ""]:
+        """Third term of Eq. overall."""
+        (first, second), feature = targets, None
+        assert first.codes is not None
+        assert first.valid is not None
+        assert second.codes is not None
+        assert second.valid is not None
+        codes, valid = blend_targets(
+            first.codes, first.valid, second.codes, second.valid, plan.k, self.blend
+        )
+        if plan.reuse is not None:
+            self.skips.skip("blend_reuse")
+            feature = renders[plan.reuse].feature
+        else:
+            with self.skips.doing("blended render"):
+                feature = self.model.render(plan.camera, color=False, fused=fused).feature
         assert feature is not None
-        self.skips.blends_done += 1
-        return self.losses.blended_loss(feature, codes, valid, similarity), weight
+        return self.losses.blended_loss(feature, codes, valid, plan.similarity)
 
     def _color_mse(self, renders: list[ViewRender], targets: tuple[Target, ...]) -> float:
         with torch.no_grad():

@@ -25,6 +25,7 @@ def capture(module: VLGSModule, meta: dict[str, Any]) -> Checkpoint:
         "train_seconds": module.train_seconds,
         "results_version": RESULTS_VERSION,
         "sh_degree": module.model.sh_degree,
+        "skips": module.skips.state(),
     }
     # safetensors shares no storage: views of one tensor are written twice rather than refused.
     return Checkpoint(module.next_step, {k: v.clone() for k, v in tensors.items()}, meta | own)
@@ -51,6 +52,7 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
     module.densify_state.count = checkpoint.tensors["densify.count"]
     module.next_step = checkpoint.step
     module.train_seconds = float(checkpoint.meta["train_seconds"])
+    module.skips.restore(checkpoint.meta.get("skips", {}))
     module.model.sh_degree = int(checkpoint.meta["sh_degree"])
 
 

@@ -81,8 +81,10 @@ def _lay_out(
     groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
 ) -> tuple[_Layout, list[Tensor]]:
     """Groups with the very same weight tensor share a chain; returns the weights, one per chain."""
+    share = config.share_chains
+    names = [(id(g.weight) if share else i, g.shape_grad) for i, g in enumerate(groups)]
     chains: dict[tuple[int, bool], int] = {}
-    chain_of = [chains.setdefault((id(g.weight), g.shape_grad), len(chains)) for g in groups]
+    chain_of = [chains.setdefault(name, len(chains)) for name in names]
     order = sorted(range(len(groups)), key=chain_of.__getitem__)
     weights = [groups[chain_of.index(c)].weight for c in range(len(chains))]
     shape_grads = [shape_grad for _, shape_grad in chains]
@@ -101,6 +103,9 @@ def _kernel_config(config: RasterConfig) -> _csrc.BlendConfig:
         config.transmittance_min,
         config.stop == "before",
         config.memory_budget,
+        config.tile_test,
+        config.block_masks,
+        config.opacity_extent,
     )
 
 
@@ -113,6 +118,32 @@ def _kernel_camera(camera: Camera, config: RasterConfig) -> _csrc.Camera:
     ]  # fmt: skip
     viewmat = camera.viewmat.flatten().tolist()
     return _csrc.Camera(viewmat, [fx, fy, cx, cy], slopes, config.near, config.eps2d)
+
+
+def freeze(
+    splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig
+) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, Tensor]:
+    """A picture of nothing but weights, as the kernel holds it, with `visible` and the accumulated weight."""
+    nothing = ChannelGroup(weight.new_zeros(len(weight), 1), weight.contiguous())
+    layout, weights = _lay_out([nothing], camera, config)
+    picture, visible, alphas, _ = _draw(layout, splats, weights, [nothing.values])
+    return picture, visible, alphas[0]
+
+
+def _draw(
+    layout: _Layout, splats: Splats, weights: Sequence[Tensor], values: Sequence[Tensor]
+) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, list[Tensor], list[Tensor]]:
+    """The kernel's picture with (visible, alpha per chain, image per group)."""
+    depth, size = splats.depth, (layout.height, layout.width)
+    visible = torch.empty(len(depth), dtype=torch.bool)
+    alphas = [depth.new_empty(size) for _ in weights]
+    images = [depth.new_empty(*size, v.shape[1]) for v in values]
+    kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
+    picture = kernel(
+        *splats, weights, layout.shape_grads, values, layout.order,
+        layout.chain_of, layout.config, images, alphas, visible, torch.get_num_threads(),
+    )  # fmt: skip
+    return picture, visible, alphas, images
 
 
 class _Project(torch.autograd.Function):
@@ -151,15 +182,8 @@ class _Blend(torch.autograd.Function):
         num_chains = len(layout.shape_grads)
         rest = tuple(t.contiguous() for t in rest)
         weights, values = rest[:num_chains], rest[num_chains:]
-        size = (layout.height, layout.width)
-        visible = torch.empty(len(depth), dtype=torch.bool)
-        alphas = [depth.new_empty(size) for _ in weights]
-        images = [depth.new_empty(*size, v.shape[1]) for v in values]
-        kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
-        ctx.blend = kernel(
-            mean2d, ellipse, depth, weights, layout.shape_grads, values, layout.order,
-            layout.chain_of, layout.config, images, alphas, visible, torch.get_num_threads(),
-        )  # fmt: skip
+        splats = Splats(mean2d, ellipse, depth)
+        ctx.blend, visible, alphas, images = _draw(layout, splats, weights, values)
         ctx.save_for_backward(mean2d, ellipse, *rest)
         ctx.num_chains = num_chains
         ctx.set_materialize_grads(False)

@@ -1,5 +1,6 @@
 """A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
@@ -11,6 +12,7 @@ from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import sh_to_rgb, view_color
 from vlgs.geometry import camera_center
 from vlgs.indicator import Indicator
+from vlgs.render.frustum import may_see
 from vlgs.render.rasterize import rasterize
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
@@ -26,6 +28,8 @@ class FusedGaussians:
     """u_4.. of Eq. attention."""
     language_weight: Float[Tensor, " n"]
     """What blends language: l, o or a constant, as the indicator says (Eq. lancity)."""
+    rows: int
+    """How many were fused; all, unless they were fused for some cameras alone."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +82,27 @@ class SplatModel(nn.Module):
         """The Gaussians in natural units."""
         return activate(self.splats)
 
-    def fuse(self) -> FusedGaussians:
-        """Activate and fuse all Gaussians; once per iteration, however many views are rendered."""
+    def fuse(self, cameras: Sequence[Camera] | None = None) -> FusedGaussians:
+        """Activate and fuse all Gaussians; once per iteration, however many views are rendered.
+
+        Args:
+            cameras: The only ones that will be rendered from; Gaussians that none of them may see are left at zero, unfused.
+        """
         gaussians = self.gaussians()
-        color, feature = self.fusion(sh_to_rgb(gaussians.sh0), gaussians.features)
-        return FusedGaussians(gaussians, color, feature, self.indicator(gaussians))
+        color, feature = sh_to_rgb(gaussians.sh0), gaussians.features
+        count = self.count
+        if cameras is None:
+            color, feature = self.fusion(color, feature)
+        else:
+            seen = torch.stack([may_see(gaussians, c, self.raster) for c in cameras]).any(dim=0)
+            rows = seen.nonzero()[:, 0]
+            count = len(rows)
+            some = self.fusion(color[rows], feature[rows])
+            color, feature = (
+                torch.zeros_like(whole).index_copy(0, rows, part)
+                for whole, part in zip((color, feature), some, strict=True)
+            )
+        return FusedGaussians(gaussians, color, feature, self.indicator(gaussians), count)
 
     def render(
         self,
@@ -107,7 +127,7 @@ class SplatModel(nn.Module):
         fused = self.fuse() if fused is None else fused
         groups = []
         if color:
-            groups.append(ChannelGroup(self._view_color(fused, camera), fused.gaussians.opacities))
+            groups.append(ChannelGroup(self.view_color(fused, camera), fused.gaussians.opacities))
         if language:
             groups.append(ChannelGroup(fused.feature, fused.language_weight))
         out = self._rasterize(fused.gaussians, groups, camera)
@@ -127,7 +147,8 @@ class SplatModel(nn.Module):
         gaussians = self.gaussians()
         return self._rasterize(gaussians, [ChannelGroup(values, weight)], camera).images[0]
 
-    def _view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
+    def view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
+        """RGB of every Gaussian as a camera sees it, >= 0."""
         gaussians, eye = fused.gaussians, camera_center(camera.viewmat)
         return view_color(fused.color, gaussians.shN, gaussians.means, eye, self.sh_degree)
 

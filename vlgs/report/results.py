@@ -41,6 +41,11 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "test_views_seen": ("", "held-out views that were also trained on; 0 for a fair split"),
     "n_gaussians": ("", "Gaussians at the end"),
     "train_seconds": ("s", "wall time of training, without reading, evaluation and pictures"),
+    "skips": (
+        "",
+        "skip of vlgs.skips -> skipped (count), share (of that work), seconds_saved (wall time: count x mean cost of the "
+        "forward part in this run; null where none was done to measure)",
+    ),
     "peak_rss_bytes": ("B", "most memory the process ever held, reading to reporting"),
     "fps_color": ("1/s", "colour render, median"),
     "fps_language": ("1/s", "language render, median"),

@@ -50,6 +50,8 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     per_category = metrics.get("per_category") or {}
     for category, iou in per_category.items():
         table.add_row(Text(f"  {category}"), "--" if iou is None else f"{iou:.1%}", style="dim")
+    for name, entry in (metrics.get("skips") or {}).items():
+        table.add_row(Text(f"  skipped: {name}"), _skipped(entry), style="dim")
     reasons = {name: why for name, why in metrics["reasons"].items() if name not in _SILENT}
     notes = [Text(f"{name}: {why}", style="yellow") for name, why in reasons.items()]
     if metrics.get("failure"):
@@ -57,6 +59,13 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     width = max((len(label) for label in paths), default=0)
     places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
     return Group(table, *notes, Text(f"protocol: {metrics['protocol']}"), *places)
+
+
+def _skipped(entry: Mapping[str, Any]) -> str:
+    """E.g. ``5,994 (98.8%), saved ~12.1 s``."""
+    text = f"{entry['skipped']:,} ({entry['share']:.1%})"
+    saved = entry["seconds_saved"]
+    return text if saved is None else f"{text}, saved ~{saved:.1f} s"
 
 
 def print_summary(

@@ -1,0 +1,107 @@
+"""Training on geometry that does not move: what is constant about a view is computed once."""
+
+from collections.abc import Hashable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.gaussians.parameters import PARAMETERS
+from vlgs.module.skips import SkipCount
+from vlgs.render.frozen import FrozenView, FrozenViews
+from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
+from vlgs.types import Camera
+
+GEOMETRY = frozenset({"means", "quats", "log_scales"})
+
+
+def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None:
+    """Take the gradients of some parameters away.
+
+    Raises:
+        ValueError: If a name is unknown, or Gaussians would still multiply and die, or their weights be reset.
+    """
+    unknown = sorted(set(names) - set(PARAMETERS))
+    if unknown:
+        raise ValueError(
+            f"train: trainer.freeze must name some of {', '.join(PARAMETERS)}, got {unknown}"
+        )
+    if names and densify_stop > 0:
+        raise ValueError(
+            "train: gaussians.densify.stop must be 0 where trainer.freeze keeps parameters, or densification moves "
+            f"them, got {densify_stop}"
+        )
+    for name in names:
+        model.splats[name].requires_grad_(False)
+
+
+class FrozenRenders:
+    """Renders of the training views from kept weights, wherever the weights that are asked for are constant.
+
+    Args:
+        model: Whose means, quats and scales do not change.
+        budget: Bytes for the weights of all views.
+        counts: Where work done and left out is counted.
+    """
+
+    def __init__(self, model: SplatModel, budget: int, counts: SkipCount) -> None:
+        self.model = model
+        self.views = FrozenViews(budget)
+        self.counts = counts
+        self._colors: dict[int, Tensor] = {}
+
+    def render(
+        self, index: int, camera: Camera, language: bool, fused: FusedGaussians
+    ) -> ViewRender | None:
+        """A training view in colour, and in language if wanted; None where it must be rendered in full."""
+        opacities = fused.gaussians.opacities
+        if opacities.requires_grad or (language and fused.language_weight.requires_grad):
+            return None
+        by_color = self._view((index, "opacity"), camera, opacities, fused)
+        by_language = by_color
+        if language and fused.language_weight is not opacities:
+            by_language = self._view((index, "language"), camera, fused.language_weight, fused)
+        if by_color is None or by_language is None:
+            return None
+        return ViewRender(
+            color=self._color(index, camera, by_color, fused),
+            feature=by_language.render(fused.feature) if language else None,
+            alpha_color=by_color.alpha,
+            alpha_language=by_language.alpha if language else None,
+            visible=by_color.visible | by_language.visible,
+            mean2d=by_color.mean2d,
+        )
+
+    def _view(
+        self, name: Hashable, camera: Camera, weight: Float[Tensor, " n"], fused: FusedGaussians
+    ) -> FrozenView | None:
+        view = self.views.get(name)
+        if view is not None:
+            self.counts.skip("frozen_weights")
+            return view
+        if self.views.refused(name):
+            return None
+        with self.counts.doing("weights"):
+            return self.views.make(
+                name,
+                means=fused.gaussians.means,
+                quats=fused.gaussians.quats,
+                scales=fused.gaussians.scales,
+                weight=weight,
+                camera=camera,
+                config=self.model.raster,
+            )
+
+    def _color(
+        self, index: int, camera: Camera, view: FrozenView, fused: FusedGaussians
+    ) -> Float[Tensor, "h w 3"]:
+        """The colour image; kept too where nothing that it depends on is trained."""
+        if index in self._colors:
+            self.counts.skip("frozen_color")
+            return self._colors[index]
+        values = self.model.view_color(fused, camera)
+        if values.requires_grad:
+            return view.render(values)
+        with self.counts.doing("color render"), torch.no_grad():
+            self._colors[index] = view.render(values)
+        return self._colors[index]
