@@ -153,10 +153,12 @@ NB_MODULE(_csrc, m) {
       .def(
           "__init__",
           [](BlendConfig *self, double alpha_min, double alpha_max, double transmittance_min,
-             bool stop_before, int64_t memory_budget) {
-            new (self) BlendConfig{alpha_min, alpha_max, transmittance_min, stop_before, memory_budget};
+             bool stop_before, int64_t memory_budget, bool tile_test, bool block_masks, bool opacity_extent) {
+            new (self) BlendConfig{alpha_min,   alpha_max,     transmittance_min,
+                                   stop_before, memory_budget, {tile_test, block_masks, opacity_extent}};
           },
-          "alpha_min"_a, "alpha_max"_a, "transmittance_min"_a, "stop_before"_a, "memory_budget"_a);
+          "alpha_min"_a, "alpha_max"_a, "transmittance_min"_a, "stop_before"_a, "memory_budget"_a,
+          "tile_test"_a, "block_masks"_a, "opacity_extent"_a);
   bind_project<float>(m);
   bind_project<double>(m);
   bind_blend<float>(m, "BlendFloat");

@@ -86,6 +86,20 @@ T widest(const DepthOrder<T> &order, int64_t n, int chains, int64_t i) {
   return cutoff;
 }
 
+bool listed(uint16_t mask, const Trim &trim) { return mask || !trim.tile_test; }
+uint16_t trimmed(uint16_t mask, const Trim &trim) {
+  return !trim.block_masks && listed(mask, trim) ? 0xFFFF : mask;
+}
+
+// Whether a Gaussian reaches a pixel, where its masks were made for a wider ellipse.
+template <class T>
+bool reaches_any(const Grid &grid, const T *g, T cutoff) {
+  const Box box = box_of(grid, g[kMeanX], g[kMeanY], g[kInvSigmaX], g[kSlope], g[kInvSigmaY], cutoff);
+  std::vector<uint16_t> masks(size_t(Extent<T>{box, cutoff}.tiles()));
+  kernels<T>().cover(grid, g, cutoff, box, masks.data());
+  return std::any_of(masks.begin(), masks.end(), [](uint16_t mask) { return mask != 0; });
+}
+
 void check_budget(int64_t entries, int64_t bytes_each, int64_t budget) {
   if (entries > budget / bytes_each)
     throw std::invalid_argument(
@@ -139,7 +153,7 @@ DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
 
 template <class T>
 TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, const T *records, int chains,
-                     int64_t budget, bool *visible, int threads) {
+                     T alpha_min, const Trim &trim, int64_t budget, bool *visible, int threads) {
   const int64_t tiles = grid.tiles_x * grid.tiles_y, m = order.count;
   std::fill(visible, visible + n, false);
 
@@ -147,7 +161,9 @@ TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, co
   Buffer<int64_t> first(m + 1);  // of the masks of each rank
 #pragma omp parallel for num_threads(threads)
   for (int64_t rank = 0; rank < m; ++rank) {
-    const T *g = records + rank * kRecord, cutoff = widest(order, n, chains, order.ids[rank]);
+    const T *g = records + rank * kRecord;
+    const T cutoff =
+        trim.opacity_extent ? widest(order, n, chains, order.ids[rank]) : std::log2(1 / alpha_min);
     extents[rank] = {box_of(grid, g[kMeanX], g[kMeanY], g[kInvSigmaX], g[kSlope], g[kInvSigmaY], cutoff),
                      cutoff};
     first[rank + 1] = extents[rank].tiles();
@@ -170,9 +186,12 @@ TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, co
       bool reaches = false;
       for (int64_t y = e.box.y0; y < e.box.y1; ++y)
         for (int64_t x = e.box.x0; x < e.box.x1; ++x, ++mask) {
-          mine[y * grid.tiles_x + x] += *mask != 0;
           reaches |= *mask != 0;
+          *mask = trimmed(*mask, trim);
+          mine[y * grid.tiles_x + x] += listed(*mask, trim);
         }
+      if (!trim.opacity_extent)
+        reaches = reaches_any(grid, records + rank * kRecord, widest(order, n, chains, order.ids[rank]));
       visible[order.ids[rank]] = reaches;
     }
   }
@@ -204,7 +223,7 @@ TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, co
       const uint16_t *mask = masks.data() + first[rank];
       for (int64_t y = box.y0; y < box.y1; ++y)
         for (int64_t x = box.x0; x < box.x1; ++x, ++mask)
-          if (*mask) {
+          if (listed(*mask, trim)) {
             const int64_t place = mine[y * grid.tiles_x + x]++;
             lists.ranks[place] = uint32_t(rank);
             lists.masks[place] = *mask;
@@ -218,9 +237,9 @@ template DepthOrder<float> sort_visible(const Grid &, int64_t, const Splats<floa
                                         const std::vector<const float *> &, float, int);
 template DepthOrder<double> sort_visible(const Grid &, int64_t, const Splats<double> &,
                                          const std::vector<const double *> &, double, int);
-template TileLists make_lists(const Grid &, int64_t, const DepthOrder<float> &, const float *, int, int64_t,
-                              bool *, int);
-template TileLists make_lists(const Grid &, int64_t, const DepthOrder<double> &, const double *, int, int64_t,
-                              bool *, int);
+template TileLists make_lists(const Grid &, int64_t, const DepthOrder<float> &, const float *, int, float,
+                              const Trim &, int64_t, bool *, int);
+template TileLists make_lists(const Grid &, int64_t, const DepthOrder<double> &, const double *, int, double,
+                              const Trim &, int64_t, bool *, int);
 
 }  // namespace vlgs

@@ -23,6 +23,13 @@ struct DepthOrder {
       cutoffs;  // [chains, n] largest exponent at which alpha_min is reached, negative where it never is
 };
 
+// What is left out of the lists; without, they are longer and the pictures the same.
+struct Trim {
+  bool tile_test;       // tiles of the box that the ellipse misses
+  bool block_masks;     // blocks of a tile that it misses
+  bool opacity_extent;  // what lies beyond alpha_min for this weight, rather than for a weight of 1
+};
+
 // Throws std::invalid_argument naming a weight that is not in [0, 1].
 template <class T>
 DepthOrder<T> sort_visible(const Grid &, int64_t n, const Splats<T> &, const std::vector<const T *> &weights,
@@ -39,6 +46,6 @@ struct TileLists {
 // any chain. Throws std::invalid_argument if the lists would take more than `budget` bytes.
 template <class T>
 TileLists make_lists(const Grid &, int64_t n, const DepthOrder<T> &, const T *records, int chains,
-                     int64_t budget, bool *visible, int threads);
+                     T alpha_min, const Trim &, int64_t budget, bool *visible, int threads);
 
 }  // namespace vlgs

@@ -63,8 +63,8 @@ Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vecto
     stages_.push_back(make_stage(first, std::min(kMaxChains, num_chains - first)));
     fill_records(stages_.back(), splats, row_threads);
   }
-  lists_ = make_lists(grid, n, order_, stages_[0].records.data(), num_chains, config.memory_budget, visible,
-                      row_threads);
+  lists_ = make_lists(grid, n, order_, stages_[0].records.data(), num_chains, T(config.alpha_min),
+                      config.trim, config.memory_budget, visible, row_threads);
   for (Stage &s : stages_) render(s, worth(lists_.begin.back() + grid.tiles_x * grid.tiles_y, threads));
 }
 

@@ -18,6 +18,7 @@ struct BlendConfig {
   double alpha_min, alpha_max, transmittance_min;
   bool stop_before;
   int64_t memory_budget;  // bytes
+  Trim trim;
 };
 
 template <class T>

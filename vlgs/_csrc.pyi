@@ -25,6 +25,9 @@ class BlendConfig:
         transmittance_min: float,
         stop_before: bool,
         memory_budget: int,
+        tile_test: bool,
+        block_masks: bool,
+        opacity_extent: bool,
     ) -> None: ...
 
 def project(

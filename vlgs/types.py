@@ -156,6 +156,14 @@ class RasterConfig:
     ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]`` with m this value."""
     memory_budget: int = 2 << 30
     """Bytes the tile lists may take; more is refused with an error before anything is allocated."""
+    tile_test: bool = True
+    """Whether tiles of the bounding box that the ellipse misses are left out (`vlgs.skips`)."""
+    block_masks: bool = True
+    """Whether 4x4 blocks of a tile that the ellipse misses are left out."""
+    opacity_extent: bool = True
+    """Whether the ellipse is cut where the Gaussian's own weight reaches `alpha_min`, rather than a weight of 1."""
+    share_chains: bool = True
+    """Whether groups with one weight tensor share one transmittance."""
 
 
 @dataclass(frozen=True)

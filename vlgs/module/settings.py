@@ -1,6 +1,7 @@
 """Settings of a training run, mirrored by conf/trainer."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,32 @@ class LearningRates:
 
 
 @dataclass(frozen=True)
+class SkipConfig:
+    """Work of an iteration that is left out; `vlgs.skips` says what each costs in accuracy."""
+
+    fuse_visible: bool = False
+    """Fuse only Gaussians that a view of the iteration may see."""
+    blend_weight: float = 0.0
+    """Blended views with lambda * SSIM(I1, I2) up to this are not rendered; negative: every one is."""
+    blend_reuse: float = 0.0
+    """Blended views with min(k, 1 - k) below this take the language of the real view; 0: none."""
+    frozen_weights: bool = True
+    """Keep the blending weights of every view when geometry and weights are frozen."""
+    frozen_budget: int = 2 << 30
+    """Bytes that the kept weights of all views may take together."""
+    finite_check: bool = False
+    """Leave out the search for gradients that are not finite."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.blend_reuse <= 0.5:
+            raise ValueError(f"skip: blend_reuse must be in [0, 0.5], got {self.blend_reuse}")
+        if not -float("inf") < self.blend_weight < float("inf"):
+            raise ValueError(f"skip: blend_weight must be finite, got {self.blend_weight}")
+        if self.frozen_budget < 0:
+            raise ValueError(f"skip: frozen_budget must be at least 0, got {self.frozen_budget}")
+
+
+@dataclass(frozen=True)
 class TrainerConfig:
     """Budget and schedule of a run."""
 
@@ -34,6 +61,9 @@ class TrainerConfig:
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
+    freeze: Sequence[str] = ()
+    """Parameters of the Gaussians that keep their values, names of `vlgs.gaussians.PARAMETERS`."""
+    skip: SkipConfig = field(default_factory=SkipConfig)
 
     def __post_init__(self) -> None:
         if self.iterations < 1:

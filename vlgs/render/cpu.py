@@ -81,8 +81,10 @@ def _lay_out(
     groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
 ) -> tuple[_Layout, list[Tensor]]:
     """Groups with the very same weight tensor share a chain; returns the weights, one per chain."""
+    share = config.share_chains
+    names = [(id(g.weight) if share else i, g.shape_grad) for i, g in enumerate(groups)]
     chains: dict[tuple[int, bool], int] = {}
-    chain_of = [chains.setdefault((id(g.weight), g.shape_grad), len(chains)) for g in groups]
+    chain_of = [chains.setdefault(name, len(chains)) for name in names]
     order = sorted(range(len(groups)), key=chain_of.__getitem__)
     weights = [groups[chain_of.index(c)].weight for c in range(len(chains))]
     shape_grads = [shape_grad for _, shape_grad in chains]
@@ -101,6 +103,9 @@ def _kernel_config(config: RasterConfig) -> _csrc.BlendConfig:
         config.transmittance_min,
         config.stop == "before",
         config.memory_budget,
+        config.tile_test,
+        config.block_masks,
+        config.opacity_extent,
     )
 
 

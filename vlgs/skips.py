@@ -1,0 +1,179 @@
+"""Everything that the code may leave out, in one table that the benchmark and the documentation both read.
+
+A skip is *exact* (the same numbers, to the bit or to float order), *bounded* (off by at most what `Skip.bound` says) or
+*statistical*. One that costs nothing and loses nothing has no switch; it stands here because it explains the speed.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Value = bool | float | None
+
+
+@dataclass(frozen=True)
+class Skip:
+    """One piece of work that need not be done."""
+
+    name: str
+    setting: str
+    """Dotted key of the configuration; empty where the skip cannot be turned off."""
+    on: Value
+    """Value of the key with which the work is left out."""
+    off: Value
+    """Value of the key with which it is done."""
+    default: Literal["on", "off"]
+    """What a run does that says nothing."""
+    kind: Literal["exact", "bounded", "statistical"]
+    bound: str
+    """Exact: ``same bits`` or ``<= 1e-6``. Bounded: the formula in words."""
+    what: str
+    """One sentence: what is not computed."""
+    source: str
+
+    @property
+    def switchable(self) -> bool:
+        """Whether the work can be done all the same, to see what leaving it out saves."""
+        return bool(self.setting)
+
+    def override(self, on: bool) -> str:
+        """The Hydra override that turns it on or off.
+
+        Example:
+            >>> named("tile_test").override(on=False)
+            'raster.tile_test=false'
+        """
+        if not self.switchable:
+            raise ValueError(f"skip {self.name}: must have a switch to be turned, got none")
+        value = self.on if on else self.off
+        return f"{self.setting}={str(value).lower() if isinstance(value, bool) else value}"
+
+
+def _always(name: str, bound: str, what: str, source: str) -> Skip:
+    return Skip(name, "", None, None, "on", "exact", bound, what, source)
+
+
+SKIPS: tuple[Skip, ...] = (
+    Skip(
+        "tile_test", "raster.tile_test", True, False, "on", "exact", "same bits",
+        "A Gaussian is not listed in a tile of its bounding box that its ellipse does not reach.",
+        "Speedy-Splat 2412.00578 (AccuTile)",
+    ),
+    Skip(
+        "block_masks", "raster.block_masks", True, False, "on", "exact", "same bits",
+        "A Gaussian is not weighed in a 4x4 block of a tile that its ellipse does not reach.",
+        "row intervals, csrc/README.md",
+    ),
+    Skip(
+        "opacity_extent", "raster.opacity_extent", True, False, "on", "exact", "same bits",
+        "The ellipse ends where weight times falloff is alpha_min; off: where a weight of 1 would be.",
+        "StopThePop 2402.00525, B.2",
+    ),
+    Skip(
+        "shared_chain", "raster.share_chains", True, False, "on", "exact", "<= 1e-6",
+        "Groups blended with one weight tensor share one alpha and transmittance (indicator=opacity).",
+        "vlgs",
+    ),
+    Skip(
+        "early_stop", "raster.transmittance_min", 1e-4, 0.0, "on", "bounded",
+        "stop=after: transmittance_min * max |value|; stop=before: that / (1 - alpha_max)",
+        "What lies behind a pixel's transmittance_min is not blended; per group, and a block ends when all its groups have.",
+        "3DGS; the bound: pitfall of stopping before",
+    ),
+    Skip(
+        "fuse_visible", "trainer.skip.fuse_visible", True, False, "off", "exact", "<= 1e-6",
+        "Gaussians outside all views of an iteration are not fused.",
+        "the fusion of a Gaussian depends on itself alone (Eq. attention)",
+    ),
+    Skip(
+        "blend_zero", "trainer.skip.blend_weight", 0.0, -1.0, "on", "exact", "same bits",
+        "The blended view is not rendered where lambda * SSIM(I1, I2) is 0.",
+        "Eq. blend, SSIM clamped at 0",
+    ),
+    Skip(
+        "blend_small", "trainer.skip.blend_weight", 0.5, 0.0, "off", "bounded",
+        "the loss changes by at most blend_weight * MSE of the blended view",
+        "The blended view is not rendered where lambda * SSIM(I1, I2) <= blend_weight.",
+        "Eq. blend",
+    ),
+    Skip(
+        "blend_reuse", "trainer.skip.blend_reuse", 0.01, 0.0, "off", "bounded",
+        "the camera is off by at most blend_reuse * the distance and the angle between the two views",
+        "The blended view is not rendered where min(k, 1 - k) < blend_reuse: the real view's language stands for it.",
+        "42 % of Beta(0.2, 0.2) lie within 0.01 of an end",
+    ),
+    Skip(
+        "frozen_weights", "trainer.skip.frozen_weights", True, False, "on", "exact", "<= 1e-6",
+        "With frozen geometry (trainer.freeze) lists and blending weights of a view are kept, and a render is a sparse product.",
+        "LangSplat trains features on frozen 3DGS; the rest is vlgs",
+    ),
+    Skip(
+        "finite_check", "trainer.skip.finite_check", True, False, "off", "exact", "same bits",
+        "Gradients are not looked through for what is not finite; a broken run is noticed by its loss, a step later.",
+        "vlgs",
+    ),
+    _always(
+        "culling", "same bits",
+        "Gaussians behind the camera, beside the image or below alpha_min in every group are neither sorted nor listed.",
+        "3DGS",
+    ),
+    _always(
+        "unneeded_gradients", "same bits",
+        "Gradients that nothing asks for are not formed: of frozen parameters, of a group whose image the loss does not use.",
+        "autograd",
+    ),
+    _always(
+        "unused_modality", "same bits",
+        "A blended view renders language alone; a scene or view without language renders colour alone, unfused.",
+        "Eq. overall",
+    ),
+    _always(
+        "similarity_cache", "same bits",
+        "SSIM(I1, I2) is a constant of a pair and computed once.",
+        "Eq. blend",
+    ),
+    _always(
+        "sh_degree", "same bits",
+        "Spherical harmonics of degrees that have not joined yet are not evaluated.",
+        "3DGS",
+    ),
+    _always(
+        "unmasked_pixels", "same bits",
+        "Pixels without a mask form no language error.",
+        "LangSplat",
+    ),
+    _always(
+        "known_runs", "same bits",
+        "A run that exists is reported, not repeated (on_existing=resume).",
+        "the run id hashes all that can move a number",
+    ),
+)  # fmt: skip
+"""In the order of the documentation: rasterizer, training, what has no switch."""
+
+
+def named(name: str) -> Skip:
+    """The skip of that name.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    for skip in SKIPS:
+        if skip.name == name:
+            return skip
+    raise ValueError(f"skips: name must be one of {[s.name for s in SKIPS]}, got {name!r}")
+
+
+def markdown_table() -> str:
+    """`SKIPS` as README.md shows them."""
+    rows = []
+    for s in SKIPS:
+        switch = f"`{s.setting}`: {_value(s.on)} / {_value(s.off)}" if s.switchable else "always on"
+        default = s.default if s.switchable else "on"
+        rows.append(f"| `{s.name}` | {switch} | {default} | {s.kind}, {s.bound} | {s.what} |")
+    head = (
+        "| skip | switch: on / off | default | class | what is left out |\n|---|---|---|---|---|\n"
+    )
+    return head + "\n".join(rows)
+
+
+def _value(value: Value) -> str:
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}"
