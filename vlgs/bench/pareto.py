@@ -1,0 +1,137 @@
+"""Run time against error: which ways to render nothing else beats in both."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from vlgs.bench.sheet import COLORS, STYLE, read_sheet, say, show, write_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MEASURES = {
+    "error_image_mean": "mean image error",
+    "worst_gradient": "worst gradient, relative L2",
+}
+TRUTHS = {
+    "no_cutoffs": "against float64 without cut-offs",
+    "same_cutoffs": "against float64 with the same cut-offs",
+}
+MARKERS = {"preset": "o", "switch": "s"}
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Whether each point (time, error) is on the front: none other is as good in both and better in one.
+
+    Example:
+        >>> front([(1, 5), (2, 2), (3, 2), (4, 1)])
+        [True, True, False, True]
+    """
+    return [not any(a <= x and b <= y and (a < x or b < y) for a, b in points) for x, y in points]
+
+
+def run_pareto(out: Path) -> None:
+    """Draw pareto.png from error.csv and print the table.
+
+    Raises:
+        FileNotFoundError: If there is no error.csv.
+    """
+    table = read_sheet(out / "error.csv")
+    table["ms"] = table.forward_ms + table.backward_ms
+    table["cpu_ms"] = table.forward_cpu + table.backward_cpu
+    table["worst_gradient"] = table.filter(like="error_l2_").max(axis=1)
+    for truth in TRUTHS:
+        for measure in MEASURES:
+            for _, scene in table[table.truth == truth].groupby("scene", sort=False):
+                ways = list(zip(scene.ms, scene[measure], strict=True))
+                table.loc[scene.index, f"front_{measure}"] = front(ways)
+    draw_pareto(out / "pareto", table)
+    for truth, title in TRUTHS.items():
+        _print(table[table.truth == truth], title)
+    say(f"{out / 'pareto.png'} shows {len(table) // len(TRUTHS)} points")
+
+
+def label_of(row: "pd.Series") -> str:
+    """Short name of a point: what differs from ``default float32`` on one thread."""
+    parts = [str(row.variant)]
+    if row.precision != "float32":
+        parts.append(str(row.precision))
+    if row.threads != 1:
+        parts.append(f"{row.threads}t")
+    return ", ".join(parts)
+
+
+def draw_pareto(stem: Path, table: pd.DataFrame) -> None:
+    """One row per scene, one column per truth and measure; log-log, the front as a line."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(table.scene))
+    columns = [(truth, measure) for truth in TRUTHS for measure in MEASURES]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(4.2 * len(columns), 3.6 * len(scenes)), layout="constrained")
+        panels = figure.subplots(len(scenes), len(columns), squeeze=False)
+        for scene, line in zip(scenes, panels, strict=True):
+            for (truth, measure), panel in zip(columns, line, strict=True):
+                chosen = table[(table.scene == scene) & (table.truth == truth)]
+                _draw_panel(panel, chosen, measure)
+                panel.set_title(f"{scene}, {TRUTHS[truth]}", fontsize=7)
+        panels[0, 0].legend(loc="best")
+        write_figure(stem, figure)
+
+
+def _draw_panel(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
+    # The truth itself has error 0, which no logarithm shows.
+    table = table[table[measure] > 0].sort_values("ms")
+    on_front = table[table[f"front_{measure}"].astype(bool)]
+    panel.plot(on_front.ms, on_front[measure], color="#888888", lw=0.8, zorder=1, label="front")
+    colors = {"float32": COLORS[0], "float64": COLORS[1]}
+    for (group, precision, threads), points in table.groupby(["group", "precision", "threads"]):
+        hollow = threads != 1
+        panel.scatter(
+            points.ms, points[measure], s=18, marker=MARKERS[str(group)], linewidths=0.8, zorder=2,
+            edgecolors=colors[str(precision)], facecolors="none" if hollow else colors[str(precision)],
+            label=f"{group}, {precision}, {threads} thread{'s' if hollow else ''}",
+        )  # fmt: skip
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.margins(0.12)
+    panel.set_xlabel("forward and backward, ms (median wall clock)")
+    panel.set_ylabel(MEASURES[measure])
+    _write_labels(panel, table, measure)
+
+
+def _write_labels(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
+    """Names beside the points, in a column at the right where many have nearly one error: no two on each other."""
+    import numpy as np
+
+    if table.empty:
+        return
+    low, high = np.log10(panel.get_ylim())
+    rows = table.sort_values(measure)
+    wanted = (np.log10(rows[measure].to_numpy()) - low) / (high - low)
+    heights = np.empty(len(rows))
+    floor = 0.0
+    for i, height in enumerate(wanted):
+        floor = heights[i] = max(float(height), floor)
+        floor += 0.042
+    heights -= max(0.0, floor - 1.0)
+    for (_, row), height in zip(rows.iterrows(), heights, strict=True):
+        weight = "bold" if row[f"front_{measure}"] else "normal"
+        panel.annotate(
+            label_of(row), (row.ms, row[measure]), (1.02, height), fontsize=5.5, weight=weight,
+            textcoords="axes fraction", va="center",
+            arrowprops={"arrowstyle": "-", "lw": 0.25, "color": "#999999"},
+        )  # fmt: skip
+
+
+def _print(table: pd.DataFrame, title: str) -> None:
+    lines = []
+    for _, r in table.sort_values(["scene", "ms"], kind="stable").iterrows():
+        marks = ["yes" if r[f"front_{measure}"] else "" for measure in MEASURES]
+        errors = [f"{r[measure]:.1e}" for measure in MEASURES]
+        lines.append((r.scene, label_of(r), f"{r.ms:.2f}", f"{r.cpu_ms:.2f}", *errors, *marks))
+    columns = ("scene", "way", "ms", "CPU", *MEASURES.values(), "front (image)", "front (gradient)")
+    show(f"run time against error, {title}", columns, lines)
