@@ -158,13 +158,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             subcommand.__name__, help=subcommand.__doc__, parents=[common],
             formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         )  # fmt: skip
-        own.set_defaults(run=subcommand(own))
+        own.set_defaults(runner=subcommand(own))
     everything = commands.add_parser("all", help="All of these.", parents=[common])
-    everything.set_defaults(run=_run_all)
+    everything.set_defaults(runner=_run_all)
     args = parser.parse_args(arguments)
     args.out = args.out or Path("results/bench/quick" if args.quick else "results/bench")
     try:
-        return args.run(args)
+        return args.runner(args)
     except (ValueError, OSError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         return 1

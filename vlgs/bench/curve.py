@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import lightning as L
+import lightning as L  # noqa: N812 (its own abbreviation)
 
 from vlgs.bench.presets import Trained
 from vlgs.bench.quality import score

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 AXES = {
-    "gaussians": "Gaussians (320x240, 3+3 channels)",
-    "pixels": "pixels (50k Gaussians, 3+3 channels)",
-    "channels": "language channels (10k Gaussians, 320x240)",
-    "threads": "threads (200k Gaussians, 640x480, 3+3 channels)",
+    "gaussians": "Gaussians",
+    "pixels": "pixels",
+    "channels": "language channels",
+    "threads": "threads",
 }
+"""What grows, one series each."""
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 IMAGES = ((160, 120), (320, 240), (640, 480), (1280, 720), (1920, 1080))
 CHANNELS = (1, 3, 8, 16, 32, 64, 128, 256, 512)
@@ -141,14 +142,25 @@ def _draw_series(panel: "Axes", axis: str, rows: Sequence[GrowthRow]) -> None:
         y = [t.ms for t in times]
         bars = [[t.ms - t.q1 for t in times], [t.q3 - t.ms for t in times]]
         panel.errorbar(x, y, yerr=bars, marker="o", ms=3, lw=1, color=color, label=name)
-        ideal = -1 if axis == "threads" else 1
-        panel.plot(x, [y[-1] * (v / x[-1]) ** ideal if axis != "threads" else y[0] * x[0] / v for v in x],
-                   ls="--", lw=0.6, color=color, label=f"{name}, {'ideal' if ideal < 0 else 'proportional'}")  # fmt: skip
+        power, meaning = (-1, "ideal") if axis == "threads" else (1, "proportional")
+        anchor = 0 if axis == "threads" else -1
+        line = [y[anchor] * (value / x[anchor]) ** power for value in x]
+        panel.plot(x, line, ls="--", lw=0.6, color=color, label=f"{name}, {meaning}")
     panel.set_xscale("log", base=2 if axis == "threads" else 10)
     panel.set_yscale("log")
-    title, _, rest = AXES[axis].partition(" (")
-    panel.set_xlabel(title)
-    panel.set_title(rest.rstrip(")"), fontsize=7)
+    panel.set_xlabel(AXES[axis])
+    panel.set_title(_fixed(rows[0].point), fontsize=7)
+
+
+def _fixed(p: Point) -> str:
+    """What does not grow in a point's series."""
+    parts = {
+        "gaussians": f"{p.gaussians:,} Gaussians",
+        "pixels": f"{p.width}x{p.height}",
+        "channels": f"3+{p.channels} channels",
+        "threads": f"{p.threads} thread",
+    }
+    return ", ".join(text for axis, text in parts.items() if axis != p.axis)
 
 
 def _print(rows: Sequence[GrowthRow]) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from vlgs.bench.sheet import COLORS, STYLE, read_sheet, say, show, write_figure
+from vlgs.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +34,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def run_pareto(out: Path) -> None:
-    """Draw pareto.png from error.csv and print the table.
+    """Write pareto.csv and pareto.png from error.csv and print the table.
 
     Raises:
         FileNotFoundError: If there is no error.csv.
@@ -47,10 +48,21 @@ def run_pareto(out: Path) -> None:
             for _, scene in table[table.truth == truth].groupby("scene", sort=False):
                 ways = list(zip(scene.ms, scene[measure], strict=True))
                 table.loc[scene.index, f"front_{measure}"] = front(ways)
+    _write(out, table)
     draw_pareto(out / "pareto", table)
     for truth, title in TRUTHS.items():
         _print(table[table.truth == truth], title)
     say(f"{out / 'pareto.png'} shows {len(table) // len(TRUTHS)} points")
+
+
+def _write(out: Path, table: pd.DataFrame) -> None:
+    """The points and whether they are on the front, under what error.csv says of its making."""
+    source = (out / "error.csv").read_text().splitlines(keepends=True)
+    header = "".join(line for line in source if line.startswith("#"))
+    columns = ["scene", "truth", "variant", "group", "precision", "threads", "ms", "cpu_ms"]
+    fronts = [f"front_{measure}" for measure in MEASURES]
+    body = table[[*columns, *MEASURES, *fronts]].to_csv(index=False, float_format="%.6g")
+    write_atomically(out / "pareto.csv", (header + body).encode())
 
 
 def label_of(row: "pd.Series") -> str:

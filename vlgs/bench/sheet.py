@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from vlgs import _csrc
@@ -113,11 +114,11 @@ def write_figure(stem: Path, figure: "Figure") -> list[Path]:
 
 def show(title: str, columns: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
     """Print a table that is not squeezed: what does not fit a narrow terminal wraps there."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=escape(title), title_justify="left")
     for i, name in enumerate(columns):
-        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+        table.add_column(escape(name), justify="left" if i == 0 else "right", no_wrap=True)
     for line in lines:
-        table.add_row(*line)
+        table.add_row(*map(escape, line))
     plain = Console()
     widest = plain.measure(table, options=plain.options.update(width=1000)).maximum
     Console(width=max(plain.width, widest)).print(table)
