@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING
 from vlgs.bench.child import free_memory
 from vlgs.bench.clock import Spread, spreads, take_turns
 from vlgs.bench.outcome import time_render
-from vlgs.bench.sheet import COLORS, STYLE, provenance, say, show, write_figure, write_sheet
+from vlgs.bench.sheet import (
+    COLORS,
+    STYLE,
+    plain_ticks,
+    provenance,
+    say,
+    show,
+    write_figure,
+    write_sheet,
+)
 from vlgs.bench.workload import make_workload
 from vlgs.types import RasterConfig
 
@@ -146,8 +155,14 @@ def _draw_series(panel: "Axes", axis: str, rows: Sequence[GrowthRow]) -> None:
         anchor = 0 if axis == "threads" else -1
         line = [y[anchor] * (value / x[anchor]) ** power for value in x]
         panel.plot(x, line, ls="--", lw=0.6, color=color, label=f"{name}, {meaning}")
-    panel.set_xscale("log", base=2 if axis == "threads" else 10)
+    panel.set_xscale("log")
     panel.set_yscale("log")
+    plain_ticks(panel.yaxis)
+    if axis == "threads":
+        panel.set_xticks(x, [str(value) for value in x])
+        panel.set_xticks([], minor=True)
+    elif max(x) < 100 * min(x):
+        plain_ticks(panel.xaxis)
     panel.set_xlabel(AXES[axis])
     panel.set_title(_fixed(rows[0].point), fontsize=7)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from vlgs.bench.sheet import COLORS, STYLE, read_sheet, say, show, write_figure
+from vlgs.bench.sheet import COLORS, STYLE, plain_ticks, read_sheet, say, show, write_figure
 from vlgs.files import write_atomically
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def run_pareto(out: Path) -> None:
-    """Write pareto.csv and pareto.png from error.csv and print the table.
+    """Write pareto.csv, pareto.png and pareto_rounding.png from error.csv and print the table.
 
     Raises:
         FileNotFoundError: If there is no error.csv.
@@ -49,10 +49,10 @@ def run_pareto(out: Path) -> None:
                 ways = list(zip(scene.ms, scene[measure], strict=True))
                 table.loc[scene.index, f"front_{measure}"] = front(ways)
     _write(out, table)
-    draw_pareto(out / "pareto", table)
-    for truth, title in TRUTHS.items():
+    for (truth, title), name in zip(TRUTHS.items(), ("pareto", "pareto_rounding"), strict=True):
+        draw_pareto(out / name, table[table.truth == truth])
         _print(table[table.truth == truth], title)
-    say(f"{out / 'pareto.png'} shows {len(table) // len(TRUTHS)} points")
+        say(f"picture: {out / name}.png")
 
 
 def _write(out: Path, table: pd.DataFrame) -> None:
@@ -76,21 +76,20 @@ def label_of(row: "pd.Series") -> str:
 
 
 def draw_pareto(stem: Path, table: pd.DataFrame) -> None:
-    """One row per scene, one column per truth and measure; log-log, the front as a line."""
+    """One row per scene, one column per measure; log-log, the front as a line."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(table.scene))
-    columns = [(truth, measure) for truth in TRUTHS for measure in MEASURES]
     with rc_context(STYLE):
-        figure = Figure(figsize=(4.2 * len(columns), 3.6 * len(scenes)), layout="constrained")
-        panels = figure.subplots(len(scenes), len(columns), squeeze=False)
+        figure = Figure(figsize=(10.0, 3.4 * len(scenes)), layout="constrained")
+        panels = figure.subplots(len(scenes), len(MEASURES), squeeze=False)
         for scene, line in zip(scenes, panels, strict=True):
-            for (truth, measure), panel in zip(columns, line, strict=True):
-                chosen = table[(table.scene == scene) & (table.truth == truth)]
-                _draw_panel(panel, chosen, measure)
-                panel.set_title(f"{scene}, {TRUTHS[truth]}", fontsize=7)
-        panels[0, 0].legend(loc="best")
+            for measure, panel in zip(MEASURES, line, strict=True):
+                _draw_panel(panel, table[table.scene == scene], measure)
+                panel.set_title(scene, fontsize=8)
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=6)
         write_figure(stem, figure)
 
 
@@ -110,6 +109,11 @@ def _draw_panel(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
     panel.set_xscale("log")
     panel.set_yscale("log")
     panel.margins(0.12)
+    low, high = panel.get_ylim()
+    # At least two decades: differences of a few per cent are not what this picture is about.
+    slack = max(1.0, (100 * low / high) ** 0.5)
+    panel.set_ylim(low / slack, high * slack)
+    plain_ticks(panel.xaxis)
     panel.set_xlabel("forward and backward, ms (median wall clock)")
     panel.set_ylabel(MEASURES[measure])
     _write_labels(panel, table, measure)
@@ -122,21 +126,30 @@ def _write_labels(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
     if table.empty:
         return
     low, high = np.log10(panel.get_ylim())
-    rows = table.sort_values(measure)
-    wanted = (np.log10(rows[measure].to_numpy()) - low) / (high - low)
-    heights = np.empty(len(rows))
-    floor = 0.0
-    for i, height in enumerate(wanted):
-        floor = heights[i] = max(float(height), floor)
-        floor += 0.042
-    heights -= max(0.0, floor - 1.0)
-    for (_, row), height in zip(rows.iterrows(), heights, strict=True):
-        weight = "bold" if row[f"front_{measure}"] else "normal"
+    error = np.log10(table[measure].to_numpy(float))
+    # Bottom to top; among points of nearly one error the fastest comes last, so that lines fan out and do not cross.
+    order = np.lexsort((-table.ms.to_numpy(float), error.round(1)))
+    heights = _spread_out((error[order] - low) / (high - low), gap=1.0 / 24)
+    for index, height in zip(order, heights, strict=True):
+        row = table.iloc[int(index)]
         panel.annotate(
-            label_of(row), (row.ms, row[measure]), (1.02, height), fontsize=5.5, weight=weight,
-            textcoords="axes fraction", va="center",
+            label_of(row), (row.ms, row[measure]), (1.03, height), fontsize=5.5, va="center",
+            weight="bold" if row[f"front_{measure}"] else "normal", textcoords="axes fraction",
             arrowprops={"arrowstyle": "-", "lw": 0.25, "color": "#999999"},
         )  # fmt: skip
+
+
+def _spread_out(wanted: Sequence[float], gap: float) -> list[float]:
+    """Heights in [0, 1] near the wanted ones (ascending), at least `gap` apart where there is room for that."""
+    gap = min(gap, 1.0 / max(len(wanted) - 1, 1))
+    heights: list[float] = []
+    for height in wanted:
+        heights.append(max(float(height), heights[-1] + gap if heights else 0.0))
+    ceiling = 1.0
+    for i in reversed(range(len(heights))):
+        heights[i] = min(heights[i], ceiling)
+        ceiling = heights[i] - gap
+    return heights
 
 
 def _print(table: pd.DataFrame, title: str) -> None:

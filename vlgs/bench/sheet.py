@@ -19,6 +19,7 @@ from vlgs.files import write_atomically
 from vlgs.report.provenance import commit, machine
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from matplotlib.typing import RcKeyType
 
@@ -98,6 +99,15 @@ def read_sheet(path: Path) -> pd.DataFrame:
             f"bench: {path} must exist, got none; python -m vlgs.bench {path.stem} makes it"
         )
     return pd.read_csv(path, comment="#")
+
+
+def plain_ticks(axis: "Axis") -> None:
+    """Label a logarithmic axis at 1, 2 and 5 of every decade, as plain numbers."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def write_figure(stem: Path, figure: "Figure") -> list[Path]:

@@ -14,6 +14,7 @@ from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.sheet import (
     COLORS,
     STYLE,
+    plain_ticks,
     provenance,
     read_sheet,
     say,
@@ -209,6 +210,7 @@ def _draw_curves(panel: "Axes", curves: dict[str, pd.DataFrame], column: str) ->
         style = {"color": COLORS[i % len(COLORS)], "ls": styles[i // len(COLORS) % 2]}
         panel.plot(curve.seconds, curve[column], marker="o", ms=2.5, lw=1, label=label, **style)
     panel.set_xscale("log")
+    plain_ticks(panel.xaxis)
     panel.set_xlabel("seconds of training (wall clock, evaluation not counted)")
 
 
