@@ -151,7 +151,8 @@ def test_a_broken_bound_is_status_1(
 
 
 def test_front_on_points_made_by_hand():
-    assert front([(1, 5), (2, 2), (3, 2), (4, 1), (5, 1)]) == [True, True, False, True, False]
-    assert front([(1, 1), (1, 1)]) == [True, True]
-    assert front([(2, 1), (1, 2), (2, 2)]) == [True, True, False]
+    points = [(1.0, 5.0), (2.0, 2.0), (3.0, 2.0), (4.0, 1.0), (5.0, 1.0)]
+    assert front(points) == [True, True, False, True, False]
+    assert front([(1.0, 1.0), (1.0, 1.0)]) == [True, True]
+    assert front([(2.0, 1.0), (1.0, 2.0), (2.0, 2.0)]) == [True, True, False]
     assert front([]) == []

@@ -99,7 +99,7 @@ def slope(before: tuple[float, float], after: tuple[float, float]) -> float:
     """Exponent between two points (value, time) of a power law.
 
     Example:
-        >>> slope((10, 1.0), (100, 10.0))
+        >>> slope((10.0, 1.0), (100.0, 10.0))
         1.0
     """
     return math.log(after[1] / before[1]) / math.log(after[0] / before[0])
@@ -121,8 +121,8 @@ def _measure(points: Sequence[Point], repeats: int, seed: int) -> list[GrowthRow
         exponent = None
         if rows:
             last = rows[-1]
-            before = last.point.value, last.forward.ms + last.backward.ms
-            exponent = slope(before, (p.value, forward.ms + backward.ms))
+            before = float(last.point.value), last.forward.ms + last.backward.ms
+            exponent = slope(before, (float(p.value), forward.ms + backward.ms))
         rows.append(GrowthRow(p, forward, backward, repeats, exponent))
     return rows
 

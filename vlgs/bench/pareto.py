@@ -27,7 +27,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
     """Whether each point (time, error) is on the front: none other is as good in both and better in one.
 
     Example:
-        >>> front([(1, 5), (2, 2), (3, 2), (4, 1)])
+        >>> front([(1.0, 5.0), (2.0, 2.0), (3.0, 2.0), (4.0, 1.0)])
         [True, True, False, True]
     """
     return [not any(a <= x and b <= y and (a < x or b < y) for a, b in points) for x, y in points]
@@ -46,7 +46,9 @@ def run_pareto(out: Path) -> None:
     for truth in TRUTHS:
         for measure in MEASURES:
             for _, scene in table[table.truth == truth].groupby("scene", sort=False):
-                ways = list(zip(scene.ms, scene[measure], strict=True))
+                # Errors that agree to two digits are one error: below that is chance.
+                errors = [float(f"{value:.1e}") for value in scene[measure]]
+                ways = list(zip(map(float, scene.ms), errors, strict=True))
                 table.loc[scene.index, f"front_{measure}"] = front(ways)
     _write(out, table)
     for (truth, title), name in zip(TRUTHS.items(), ("pareto", "pareto_rounding"), strict=True):
@@ -99,11 +101,13 @@ def _draw_panel(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
     on_front = table[table[f"front_{measure}"].astype(bool)]
     panel.plot(on_front.ms, on_front[measure], color="#888888", lw=0.8, zorder=1, label="front")
     colors = {"float32": COLORS[0], "float64": COLORS[1]}
-    for (group, precision, threads), points in table.groupby(["group", "precision", "threads"]):
+    for _, points in table.groupby(["group", "precision", "threads"]):
+        group, precision = str(points.group.iloc[0]), str(points.precision.iloc[0])
+        threads = int(points.threads.iloc[0])
         hollow = threads != 1
         panel.scatter(
-            points.ms, points[measure], s=18, marker=MARKERS[str(group)], linewidths=0.8, zorder=2,
-            edgecolors=colors[str(precision)], facecolors="none" if hollow else colors[str(precision)],
+            points.ms, points[measure], s=18, marker=MARKERS[group], linewidths=0.8, zorder=2,
+            edgecolors=colors[precision], facecolors="none" if hollow else colors[precision],
             label=f"{group}, {precision}, {threads} thread{'s' if hollow else ''}",
         )  # fmt: skip
     panel.set_xscale("log")
@@ -129,12 +133,12 @@ def _write_labels(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
     error = np.log10(table[measure].to_numpy(float))
     # Bottom to top; among points of nearly one error the fastest comes last, so that lines fan out and do not cross.
     order = np.lexsort((-table.ms.to_numpy(float), error.round(1)))
-    heights = _spread_out((error[order] - low) / (high - low), gap=1.0 / 24)
+    heights = _spread_out(((error[order] - low) / (high - low)).tolist(), gap=1.0 / 24)
     for index, height in zip(order, heights, strict=True):
         row = table.iloc[int(index)]
         panel.annotate(
             label_of(row), (row.ms, row[measure]), (1.03, height), fontsize=5.5, va="center",
-            weight="bold" if row[f"front_{measure}"] else "normal", textcoords="axes fraction",
+            weight="bold" if bool(row[f"front_{measure}"]) else "normal", textcoords="axes fraction",
             arrowprops={"arrowstyle": "-", "lw": 0.25, "color": "#999999"},
         )  # fmt: skip
 
@@ -155,7 +159,7 @@ def _spread_out(wanted: Sequence[float], gap: float) -> list[float]:
 def _print(table: pd.DataFrame, title: str) -> None:
     lines = []
     for _, r in table.sort_values(["scene", "ms"], kind="stable").iterrows():
-        marks = ["yes" if r[f"front_{measure}"] else "" for measure in MEASURES]
+        marks = ["yes" if bool(r[f"front_{measure}"]) else "" for measure in MEASURES]
         errors = [f"{r[measure]:.1e}" for measure in MEASURES]
         lines.append((r.scene, label_of(r), f"{r.ms:.2f}", f"{r.cpu_ms:.2f}", *errors, *marks))
     columns = ("scene", "way", "ms", "CPU", *MEASURES.values(), "front (image)", "front (gradient)")

@@ -88,7 +88,7 @@ class Summary:
 
 def scene_overrides(root: Path | None, resize: float, quick: bool) -> dict[str, tuple[str, ...]]:
     """Procedural always; the photographs at `root` where one is given."""
-    scenes = {"synthetic": QUICK if quick else ()}
+    scenes: dict[str, tuple[str, ...]] = {"synthetic": QUICK if quick else ()}
     if root is None:
         say("no photographs (--root SCENE): the procedural scene alone")
     else:
@@ -207,8 +207,17 @@ def draw_train(stem: Path, curves: dict[tuple[str, str], pd.DataFrame]) -> None:
 def _draw_curves(panel: "Axes", curves: dict[str, pd.DataFrame], column: str) -> None:
     styles = ("-", "--")
     for i, (label, curve) in enumerate(curves.items()):
-        style = {"color": COLORS[i % len(COLORS)], "ls": styles[i // len(COLORS) % 2]}
-        panel.plot(curve.seconds, curve[column], marker="o", ms=2.5, lw=1, label=label, **style)
+        color, style = COLORS[i % len(COLORS)], styles[i // len(COLORS) % 2]
+        panel.plot(
+            curve.seconds,
+            curve[column],
+            marker="o",
+            ms=2.5,
+            lw=1,
+            ls=style,
+            color=color,
+            label=label,
+        )
     panel.set_xscale("log")
     plain_ticks(panel.xaxis)
     panel.set_xlabel("seconds of training (wall clock, evaluation not counted)")
