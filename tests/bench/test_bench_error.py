@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -62,7 +63,7 @@ def test_promises_hold_and_a_wrong_kernel_breaks_them(w: Workload, monkeypatch: 
     assert violated(kept) == []
     right = outcome.rasterize
 
-    def wrong(*args, backend="cpu", **kwargs):
+    def wrong(*args: Any, backend: Any = "cpu", **kwargs: Any):
         out = right(*args, backend=backend, **kwargs)
         if backend == "reference" or args[0].dtype == torch.float64:
             return out
@@ -76,7 +77,7 @@ def test_promises_hold_and_a_wrong_kernel_breaks_them(w: Workload, monkeypatch: 
 def test_a_wrong_float64_kernel_differs_from_the_reference(monkeypatch: pytest.MonkeyPatch):
     right = outcome.rasterize
 
-    def wrong(*args, backend="cpu", **kwargs):
+    def wrong(*args: Any, backend: Any = "cpu", **kwargs: Any):
         out = right(*args, backend=backend, **kwargs)
         scale = 1.0 if backend == "reference" else 1 + 1e-8
         return replace(out, images=tuple(scale * image for image in out.images))

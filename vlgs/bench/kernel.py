@@ -137,7 +137,7 @@ def _measure(
     for job in jobs:
         # The reference is the same whatever the kernel may use: one process is enough.
         for isa, child in list(children.items())[: 1 if job.part == "reference" else None]:
-            variants[job, isa] = partial(child.call, time_job, job, seed)
+            variants[job, isa] = partial(_time_in, child, job, seed)
     needed = _bytes(size, channels, "reference" in parts) * len(children)
     name = f"{size.gaussians} Gaussians, {size.width}x{size.height}, 3+{channels} channels"
     if needed > free_memory():
@@ -153,6 +153,10 @@ def _measure(
         isa = "torch" if job.part == "reference" else isa
         rows.append(KernelRow(job, isa, forward, backward, len(passes), peer, ratio))
     return rows
+
+
+def _time_in(child: Child, job: Job, seed: int) -> Pass:
+    return child.call(time_job, job, seed)
 
 
 def time_job(job: Job, seed: int) -> Pass:

@@ -52,8 +52,8 @@ def run_pareto(out: Path) -> None:
                 table.loc[scene.index, f"front_{measure}"] = front(ways)
     _write(out, table)
     for (truth, title), name in zip(TRUTHS.items(), ("pareto", "pareto_rounding"), strict=True):
-        draw_pareto(out / name, table[table.truth == truth])
-        _print(table[table.truth == truth], title)
+        draw_pareto(out / name, table.loc[table.truth == truth])
+        _print(table.loc[table.truth == truth], title)
         say(f"picture: {out / name}.png")
 
 
@@ -88,7 +88,7 @@ def draw_pareto(stem: Path, table: pd.DataFrame) -> None:
         panels = figure.subplots(len(scenes), len(MEASURES), squeeze=False)
         for scene, line in zip(scenes, panels, strict=True):
             for measure, panel in zip(MEASURES, line, strict=True):
-                _draw_panel(panel, table[table.scene == scene], measure)
+                _draw_panel(panel, table.loc[table.scene == scene], measure)
                 panel.set_title(scene, fontsize=8)
         handles, labels = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=6)
@@ -97,7 +97,7 @@ def draw_pareto(stem: Path, table: pd.DataFrame) -> None:
 
 def _draw_panel(panel: "Axes", table: pd.DataFrame, measure: str) -> None:
     # The truth itself has error 0, which no logarithm shows.
-    table = table[table[measure] > 0].sort_values("ms")
+    table = table.loc[table[measure] > 0].sort_values(by="ms")
     on_front = table[table[f"front_{measure}"].astype(bool)]
     panel.plot(on_front.ms, on_front[measure], color="#888888", lw=0.8, zorder=1, label="front")
     colors = {"float32": COLORS[0], "float64": COLORS[1]}
