@@ -57,6 +57,7 @@ class ErrorRow:
     memory: Memory
     error: Errors
     quality: Quality
+    """Of the configuration in float32, as models are evaluated, whatever the precision of the row."""
 
 
 def make_scenes(
@@ -140,10 +141,12 @@ def _measure(
     samples = take_turns(timed, repeats)
     memory = _memories(copies, variants)
     truth: dict[RasterConfig, Outcome] = {}
+    qualities: dict[RasterConfig, Quality] = {}
     rows = []
     for v in variants:
         got = outcome(copies[v.precision], v.config)
-        quality = measure_quality(trained, v.config, presets["exact"])
+        if v.config not in qualities:
+            qualities[v.config] = measure_quality(trained, v.config, presets["exact"])
         forward, backward = spreads(samples[v])
         for label, config in (
             ("no_cutoffs", without_cutoffs(v.config)),
@@ -155,7 +158,7 @@ def _measure(
             rows.append(
                 ErrorRow(
                     name, len(w.means), c.width, c.height, *v[:4], label, forward, backward,
-                    repeats, memory[v], compare(got, truth[config]), quality,
+                    repeats, memory[v], compare(got, truth[config]), qualities[v.config],
                 )
             )  # fmt: skip
     return rows

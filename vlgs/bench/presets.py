@@ -67,6 +67,7 @@ def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
     folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint, RESULTS_VERSION))
     folder.path.mkdir(parents=True, exist_ok=True)
     with folder.writing():
+        folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
         if fit(module, folder, FitOptions(meta)) is not None:
             raise KeyboardInterrupt
     return Trained(config, scene, module)
