@@ -1,14 +1,11 @@
-"""The benchmark's scenes are the published ones, and its command line works."""
+"""The benchmark's scenes are the published ones."""
 
-import csv
 import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from vlgs.bench.__main__ import main
 from vlgs.bench.workload import make_workload
 from vlgs.render import rasterize
 from vlgs.types import ChannelGroup, RasterConfig
@@ -47,22 +44,3 @@ def test_about_as_many_gaussians_cover_a_pixel_as_asked_for():
         )
     assert out.visible.double().mean() > 0.8
     assert 0.5 < out.images[0].mean() / 1e-3 < 3
-
-
-def test_the_command_prints_and_writes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    from vlgs.bench import __main__, kernel
-
-    monkeypatch.setattr(__main__, "SIZES", (kernel.Size(200, 32, 24, 1.0),))
-    path = tmp_path / "bench" / "kernel.csv"
-    arguments = ["--sizes", "0", "--threads", "1", "--channels", "3", "5", "--repeats", "1"]
-    monkeypatch.setattr(sys, "argv", ["bench", "kernel", *arguments, "--out", str(path)])
-    main()
-    assert "rasterizer" in capsys.readouterr().out
-    lines = path.read_text().splitlines()
-    assert any(line.startswith("# cpu:") for line in lines)
-    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    assert [r["part"] for r in rows] == ["call", "blend"] * 2
-    assert all(float(r["forward"]) > 0 for r in rows)
-    assert rows[2]["opensplat"] == ""

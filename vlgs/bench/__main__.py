@@ -1,61 +1,221 @@
-"""Command line of the benchmarks."""
+"""Run time against error: `python -m vlgs.bench <what>`; results/bench/README.md says what each leaves behind."""
 
 import argparse
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import torch
-from rich.console import Console
+# Modules are imported where they are used: child processes import this file again and need little of it.
 
-from vlgs.bench.iteration import SIZES as ITERATIONS
-from vlgs.bench.iteration import measure_iteration, show_iterations
-from vlgs.bench.kernel import SIZES, measure_kernel, show_table, write_csv
-from vlgs.bench.overhead import measure_overhead
-from vlgs.bench.protocols import measure_protocols, show_protocols
+Runner = Callable[[Namespace], int]
+"""Does a subcommand; returns the exit status."""
 
 
-def main() -> None:
-    """Time what is asked for and print it."""
-    parser = argparse.ArgumentParser(prog="python -m vlgs.bench", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
-    kernel = commands.add_parser("kernel", help="forward and backward of the rasterizer")
-    kernel.add_argument("--sizes", type=int, nargs="+", default=range(len(SIZES)), metavar="ROW")
-    kernel.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    kernel.add_argument("--channels", type=int, nargs="+", default=[3], help="of language")
-    kernel.add_argument("--repeats", type=int, default=9)
-    kernel.add_argument(
-        "--out", type=Path, nargs="?", const=Path("results/bench/kernel.csv"), help="write CSV"
+def kernel(parser: ArgumentParser) -> Runner:
+    """Forward and backward of the rasterizer: sizes, channels, threads, instruction sets."""
+    parser.add_argument("--sizes", type=int, nargs="*", metavar="ROW", help="rows of the workload")
+    parser.add_argument("--channels", type=int, nargs="+", default=[3, 16, 512], help="of language")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--isa", nargs="+", default=["v4", "v3", "base"])
+    parser.add_argument("--repeats", type=int, default=9)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.kernel import DENSE_SIZES, SIZES, Size, run_kernel
+
+        sizes = [SIZES[i] for i in (range(len(SIZES)) if args.sizes is None else args.sizes)]
+        dense, channels, repeats = DENSE_SIZES, args.channels, args.repeats
+        if args.quick:
+            sizes, dense, channels, repeats = [Size(500, 64, 48)], [Size(100, 32, 24)], [3, 16], 3
+        run_kernel(sizes, dense, channels, args.threads, args.isa, repeats, args.out, args.seed)
+        return 0
+
+    return run
+
+
+def error(parser: ArgumentParser) -> Runner:
+    """Presets, switches and precisions: time, memory and error against float64; 1 if a promise is broken."""
+    parser.add_argument(
+        "--run", type=Path, help="a run folder; default: train the procedural scene"
     )
-    overhead = commands.add_parser("overhead", help="what the Trainer adds to an iteration")
-    overhead.add_argument("--iterations", type=int, default=300)
-    protocols = commands.add_parser("protocols", help="scores of many queries, without rendering")
-    protocols.add_argument("--queries", type=int, default=300)
-    protocols.add_argument("--levels", type=int, default=3, help="mask levels")
-    protocols.add_argument("--size", type=int, nargs=2, default=(986, 728), metavar=("W", "H"))
-    iteration = commands.add_parser("iteration", help="parts of a training iteration by CPU time")
-    iteration.add_argument("--sizes", type=int, nargs="+", default=range(len(ITERATIONS)))
-    iteration.add_argument("--iterations", type=int, default=20)
-    iteration.add_argument("--threads", type=int, default=2)
-    args = parser.parse_args()
-    if args.command == "iteration":
+    parser.add_argument("--no-trained", action="store_true", help="the workload alone")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=9)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.error import make_scenes, run_error
+        from vlgs.bench.presets import load_run, train_or_load
+
+        sizes = [(400, 64, 48)] if args.quick else [(50_000, 320, 240), (200_000, 640, 480)]
+        trained = None
+        if args.run is not None:
+            trained = load_run(args.run)
+        elif not args.no_trained and not args.quick:
+            trained = train_or_load([f"seed={args.seed}"], Path("results"))
+        scenes = make_scenes(sizes, trained, args.seed)
+        repeats = 3 if args.quick else args.repeats
+        broken = run_error(scenes, trained, args.threads, repeats, args.out, args.seed)
+        for check in broken:
+            print(
+                f"error: {check.scene}: {check.promise} must be at most {check.bound:.2e}, got {check.measured:.2e}",
+                file=sys.stderr,
+            )
+        return 1 if broken else 0
+
+    return run
+
+
+def pareto(parser: ArgumentParser) -> Runner:
+    """Run time against error in one picture, from error.csv."""
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.pareto import run_pareto
+
+        run_pareto(args.out)
+        return 0
+
+    return run
+
+
+def growth(parser: ArgumentParser) -> Runner:
+    """Time against Gaussians, pixels, channels and threads."""
+    parser.add_argument("--repeats", type=int, default=7)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.growth import make_points, run_growth
+
+        repeats = 3 if args.quick else args.repeats
+        run_growth(make_points(args.quick), repeats, args.out, args.seed)
+        return 0
+
+    return run
+
+
+def train(parser: ArgumentParser) -> Runner:
+    """Seconds to a PSNR and an mIoU, for presets and schedules; finished curves are not trained again."""
+    parser.add_argument("--recipes", nargs="+", help="labels of vlgs/bench/train.py; default: all")
+    parser.add_argument("--root", type=Path, help="a scene of photographs (data=colmap data.root=)")
+    parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
+    parser.add_argument("--points", type=int, default=8, help="evaluations per curve")
+    parser.add_argument("--train-threads", type=int, default=2)
+    parser.add_argument("--psnr", type=float, help="target in dB; default: that of default - 1")
+    parser.add_argument("--miou", type=float, help="target; default: that of default - 0.02")
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.train import RECIPES, run_train, scene_overrides
+
+        labels = args.recipes or (["default", "neither"] if args.quick else list(RECIPES))
+        unknown = sorted(set(labels) - set(RECIPES))
+        if unknown:
+            raise ValueError(f"bench: recipe must be one of {', '.join(RECIPES)}, got {unknown[0]}")
+        scenes = scene_overrides(args.root, args.resize, args.quick)
+        points = 2 if args.quick else args.points
+        targets = (args.psnr, args.miou)
+        run_train(scenes, labels, args.out, points, args.train_threads, args.seed, targets)
+        return 0
+
+    return run
+
+
+def overhead(parser: ArgumentParser) -> Runner:
+    """What the Trainer adds to an iteration."""
+    parser.add_argument("--iterations", type=int, default=300)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.overhead import measure_overhead
+        from vlgs.bench.sheet import say
+
+        cost = measure_overhead(3 if args.quick else args.iterations)
+        say(f"step {cost.step:.2f} ms, around it {cost.around:.2f} ms (medians)")
+        return 0
+
+    return run
+
+
+def iteration(parser: ArgumentParser) -> Runner:
+    """Parts of a training iteration by CPU time."""
+    parser.add_argument("--sizes", type=int, nargs="+", help="rows of vlgs/bench/iteration.py")
+    parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--threads", type=int, default=2)
+
+    def run(args: Namespace) -> int:
+        import torch
+
+        from vlgs.bench.iteration import SIZES, measure_iteration, show_iterations
+        from vlgs.bench.sheet import say
+
         torch.set_num_threads(args.threads)
-        measured = [(ITERATIONS[i], measure_iteration(ITERATIONS[i], args.iterations)) for i in args.sizes]
-        Console().print(show_iterations(measured))
-        return
-    if args.command == "protocols":
-        costs = measure_protocols(args.queries, args.levels, *args.size)
-        Console().print(show_protocols(costs))
-        return
-    if args.command == "overhead":
-        cost = measure_overhead(args.iterations)
-        Console().print(f"step {cost.step:.2f} ms, around it {cost.around:.2f} ms (medians)")
-        return
-    sizes = [SIZES[i] for i in args.sizes]
-    timings = measure_kernel(sizes, args.threads, args.channels, args.repeats)
-    console = Console()
-    console.print(show_table(timings), width=max(console.width, 110))
-    if args.out:
-        write_csv(timings, args.out)
+        chosen = [0] if args.quick else args.sizes or range(len(SIZES))
+        count = 3 if args.quick else args.iterations
+        measured = [(SIZES[i], measure_iteration(SIZES[i], count)) for i in chosen]
+        say(show_iterations(measured))
+        return 0
+
+    return run
+
+
+def protocols(parser: ArgumentParser) -> Runner:
+    """Scores of many queries, without rendering."""
+    parser.add_argument("--queries", type=int, default=300)
+    parser.add_argument("--levels", type=int, default=3, help="mask levels")
+    parser.add_argument("--size", type=int, nargs=2, default=(986, 728), metavar=("W", "H"))
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.protocols import measure_protocols, show_protocols
+        from vlgs.bench.sheet import say
+
+        queries, size = (2, (64, 48)) if args.quick else (args.queries, args.size)
+        say(show_protocols(measure_protocols(queries, args.levels, *size)))
+        return 0
+
+    return run
+
+
+SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
+    kernel,
+    error,
+    pareto,
+    growth,
+    train,
+    overhead,
+    iteration,
+    protocols,
+)
+"""Name, help and options of a subcommand are those of its function; `all` runs them in this order."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure what is asked for; returns the exit status, 1 where a promise is broken or the input is wrong."""
+    parser = ArgumentParser(prog="python -m vlgs.bench", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    common = ArgumentParser(add_help=False)
+    common.add_argument("--quick", action="store_true", help="small scenes: does it run?")
+    common.add_argument(
+        "--out", type=Path, help="default: results/bench, or its quick/ with --quick"
+    )
+    common.add_argument("--seed", type=int, default=0)
+    for subcommand in SUBCOMMANDS:
+        own = commands.add_parser(
+            subcommand.__name__, help=subcommand.__doc__, parents=[common],
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )  # fmt: skip
+        own.set_defaults(runner=subcommand(own))
+    everything = commands.add_parser("all", help="All of these.", parents=[common])
+    everything.set_defaults(runner=_run_all)
+    args = parser.parse_args(arguments)
+    args.out = args.out or Path("results/bench/quick" if args.quick else "results/bench")
+    try:
+        return args.runner(args)
+    except (ValueError, OSError) as problem:
+        print(f"error: {problem}", file=sys.stderr)
+        return 1
+
+
+def _run_all(args: Namespace) -> int:
+    """Every subcommand with its own defaults; a broken promise of one does not keep the others from running."""
+    shared = ["--out", str(args.out), "--seed", str(args.seed), *(["--quick"] * args.quick)]
+    return max(main([subcommand.__name__, *shared]) for subcommand in SUBCOMMANDS)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,30 +1,36 @@
-"""Time of the rasterizer: forward and backward, of the whole call and of blending alone."""
+"""Time of the rasterizer: sizes, channels, threads and instruction sets; beside it the dense reference and OpenSplat's figures."""
 
-import csv
-import statistics
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from rich.table import Table
+from torch import Tensor
 
-from vlgs import _csrc
+from vlgs.bench.child import Child, free_memory
+from vlgs.bench.clock import Pass, Spread, spreads, take_turns, time_pass
+from vlgs.bench.sheet import provenance, say, show, write_sheet
 from vlgs.bench.workload import Workload, make_workload
 from vlgs.render import cpu, rasterize
-from vlgs.report.provenance import commit, machine
-from vlgs.types import RasterConfig, Rendered
+from vlgs.types import RasterConfig
+
+ISAS = ("v4", "v3", "base")
+"""Instruction sets of the kernel, best first: AVX-512, AVX2, baseline."""
+
+REFERENCE_BYTES = 80
+"""Memory of the dense reference and its gradients per Gaussian, pixel and pair of groups, bytes: measured 70 to 76."""
 
 
 class Size(NamedTuple):
-    """One row of the workload and what the fastest public CPU rasterizer takes for it."""
+    """One scene of the workload."""
 
     gaussians: int
     width: int
     height: int
-    opensplat_ms: float
+    opensplat_ms: float | None = None
     """OpenSplat 15b7e800, `rasterizer/gsplat-cpu`, colour and language as two passes of three channels, forward and backward
     from projected splats; it has one thread. Median on an idle 2-core AMD EPYC (Zen 5, 4.4 GHz): other machines differ."""
 
@@ -37,11 +43,13 @@ SIZES = (
     Size(50_000, 640, 480, 2160),
     Size(200_000, 640, 480, 2784),
 )
+DENSE_SIZES = (Size(300, 80, 60), Size(1_000, 160, 120), Size(300, 320, 240))
+"""What the dense reference can do within a few GiB."""
 
 
 @dataclass(frozen=True)
-class Timing:
-    """Medians over the repeats, in milliseconds of wall clock; `cpu` sums over threads."""
+class Job:
+    """One thing to time; a child process gets it as it stands."""
 
     gaussians: int
     width: int
@@ -50,96 +58,171 @@ class Timing:
     """Of language; colour has 3."""
     threads: int
     part: str
-    """``call``: from Gaussians to gradients of Gaussians. ``blend``: from projected splats to gradients of splats."""
-    forward: float
-    backward: float
-    cpu: float
-    opensplat: float | None
-    """For the same work; none where it cannot do it."""
+    """``call``: from Gaussians to gradients of Gaussians. ``blend``: from projected splats to gradients of splats.
+    ``reference``: the whole call by the dense PyTorch definition."""
+
+
+@dataclass(frozen=True)
+class KernelRow:
+    """One line of kernel.csv."""
+
+    job: Job
     isa: str
+    """``torch`` for the reference, which has no code of its own."""
+    forward: Spread
+    backward: Spread
+    repeats: int
+    opensplat_ms: float | None
+    """Published, for the same work; none where it cannot do it."""
+    ratio: float | None
+    """OpenSplat's time over ours, forward and backward together."""
 
 
-def measure_kernel(
-    sizes: Sequence[Size], threads: Sequence[int], channels: Sequence[int], repeats: int
-) -> list[Timing]:
-    """Time every combination; `torch.set_num_threads` is left as it was."""
-    timings = []
+def run_kernel(
+    sizes: Sequence[Size],
+    dense_sizes: Sequence[Size],
+    channels: Sequence[int],
+    threads: Sequence[int],
+    isas: Sequence[str],
+    repeats: int,
+    out: Path,
+    seed: int = 0,
+) -> list[KernelRow]:
+    """Time every combination, print the table and write kernel.csv.
+
+    Instruction sets (each in a process of its own), threads and parts take turns within a repeat. A combination that needs more
+    memory than there is, or an instruction set that this CPU lacks, is left out with a line that says so.
+
+    Raises:
+        ValueError: If nothing is left to time.
+    """
+    header = provenance(seed, unit="milliseconds; opensplat_ms is its published figure")
+    rows: list[KernelRow] = []
+    with ExitStack() as stack:
+        children = _children(isas, stack)
+        for size in sizes:
+            for width in channels:
+                rows += _measure(children, size, width, threads, ("call", "blend"), repeats, seed)
+        for size in dense_sizes:
+            parts = ("call", "reference")
+            rows += _measure(children, size, 3, threads, parts, max(3, repeats // 3), seed)
+    write_sheet(out / "kernel.csv", rows, header)
+    _print(rows)
+    return rows
+
+
+def _children(isas: Sequence[str], stack: ExitStack) -> dict[str, Child]:
+    """A process for every instruction set that this CPU has; the kernel silently lowers what it cannot do."""
+    children: dict[str, Child] = {}
+    for isa in isas:
+        child = stack.enter_context(Child(isa))
+        if child.isa == isa:
+            children[isa] = child
+        else:
+            say(f"{isa}: this CPU has {child.isa} at best; left out")
+    return children
+
+
+def _measure(
+    children: dict[str, Child],
+    size: Size,
+    channels: int,
+    threads: Sequence[int],
+    parts: Sequence[str],
+    repeats: int,
+    seed: int,
+) -> Iterable[KernelRow]:
+    jobs = [Job(*size[:3], channels, count, part) for count in threads for part in parts]
+    variants: dict[tuple[Job, str], Callable[[], Pass]] = {}
+    for job in jobs:
+        # The reference is the same whatever the kernel may use: one process is enough.
+        for isa, child in list(children.items())[: 1 if job.part == "reference" else None]:
+            variants[job, isa] = partial(_time_in, child, job, seed)
+    needed = _bytes(size, channels, "reference" in parts) * len(children)
+    name = f"{size.gaussians} Gaussians, {size.width}x{size.height}, 3+{channels} channels"
+    if needed > free_memory():
+        say(f"{name}: needs {needed / 2**30:.1f} GiB, {free_memory() / 2**30:.1f} free; left out")
+        return []
+    say(f"{name} ...")
+    samples = take_turns(variants, repeats)
+    rows = []
+    for (job, isa), passes in samples.items():
+        forward, backward = spreads(passes)
+        peer = size.opensplat_ms if channels == 3 else None
+        ratio = None if peer is None else peer / (forward.ms + backward.ms)
+        isa = "torch" if job.part == "reference" else isa
+        rows.append(KernelRow(job, isa, forward, backward, len(passes), peer, ratio))
+    return rows
+
+
+def _time_in(child: Child, job: Job, seed: int) -> Pass:
+    return child.call(time_job, job, seed)
+
+
+def time_job(job: Job, seed: int) -> Pass:
+    """One pass of a job in this process; the workload stays for the next call."""
     before = torch.get_num_threads()
-    for size in sizes:
-        for width in channels:
-            workload = make_workload(*size[:3], channels=width)
-            for count in threads:
-                torch.set_num_threads(count)
-                for part, forward in (("call", _call(workload)), ("blend", _blend(workload))):
-                    wall = _time(workload, forward, repeats)
-                    peer = size.opensplat_ms if width == 3 else None
-                    timings.append(Timing(*size[:3], width, count, part, *wall, peer, _csrc.isa()))
-    torch.set_num_threads(before)
-    return timings
+    torch.set_num_threads(job.threads)
+    try:
+        w = _workload(job.gaussians, job.width, job.height, job.channels, seed)
+        if job.part == "blend":
+            splats, forward = _blend(w)
+            leaves = [splats.mean2d, splats.ellipse, *w.leaves()[3:]]
+            return time_pass(forward, w.upstream, leaves)
+        backend = "reference" if job.part == "reference" else "cpu"
+        return time_pass(partial(_call, w, backend), w.upstream, w.leaves())
+    finally:
+        torch.set_num_threads(before)
 
 
-def _call(w: Workload) -> Callable[[], Rendered]:
+@lru_cache(maxsize=1)
+def _workload(gaussians: int, width: int, height: int, channels: int, seed: int) -> Workload:
+    return make_workload(gaussians, width, height, channels, seed)
+
+
+def _call(w: Workload, backend: str) -> Sequence[Tensor]:
     c = w.camera
-    return lambda: rasterize(
-        w.means, w.quats, w.scales, w.groups, c.viewmat, c.K, c.width, c.height
-    )
+    shape = (w.means, w.quats, w.scales)
+    return rasterize(
+        *shape, w.groups, c.viewmat, c.K, c.width, c.height,
+        backend="reference" if backend == "reference" else "cpu",
+    ).images  # fmt: skip
 
 
-def _blend(w: Workload) -> Callable[[], Rendered]:
+def _blend(w: Workload) -> tuple[cpu.Splats, Callable[[], Sequence[Tensor]]]:
     config = RasterConfig()
     with torch.no_grad():
         splats = cpu.project(w.means, w.quats, w.scales, w.camera, config)
     leaves = cpu.Splats(
         splats.mean2d.requires_grad_(), splats.ellipse.requires_grad_(), splats.depth
     )
-    return lambda: cpu.blend(leaves, w.groups, w.camera, config)
+    return leaves, lambda: cpu.blend(leaves, w.groups, w.camera, config).images
 
 
-def _time(
-    workload: Workload, forward: Callable[[], Rendered], repeats: int
-) -> tuple[float, float, float]:
-    """Medians of (forward, backward, CPU) in ms, after two runs that are not counted."""
-    rows = []
-    for _ in range(repeats + 2):
-        for leaf in workload.leaves():
-            leaf.grad = None
-        cpu_start, start = time.process_time(), time.perf_counter()
-        out = forward()
-        middle = time.perf_counter()
-        torch.autograd.backward(out.images, workload.upstream)
-        end, cpu_end = time.perf_counter(), time.process_time()
-        rows.append((middle - start, end - middle, cpu_end - cpu_start))
-    forward_s, backward_s, cpu_s = (statistics.median(c) for c in zip(*rows[2:], strict=True))
-    return 1e3 * forward_s, 1e3 * backward_s, 1e3 * cpu_s
+def _bytes(size: Size, channels: int, dense: bool) -> int:
+    """Upper estimate of one process: image, its gradient and a copy; values and gradients; 0.5 GiB for torch and lists."""
+    pixels = size.width * size.height
+    floats = 3 * (3 + channels) * pixels + 3 * (20 + channels) * size.gaussians
+    pairs = REFERENCE_BYTES * size.gaussians * pixels if dense else 0
+    return 4 * floats + pairs + (1 << 29)
 
 
-def show_table(timings: Sequence[Timing]) -> Table:
-    """The timings with their ratio to OpenSplat's."""
-    table = Table(title=f"vlgs rasterizer, ms, {_csrc.isa()}")
-    for name in ("Gaussians", "image", "channels", "threads", "part"):
-        table.add_column(name, justify="right")
-    for name in ("forward", "backward", "both", "CPU", "OpenSplat", "ratio"):
-        table.add_column(name, justify="right")
-    for t in timings:
-        both = t.forward + t.backward
-        peer = (
-            ("", "") if t.opensplat is None else (f"{t.opensplat:.0f}", f"{t.opensplat / both:.1f}")
-        )
-        table.add_row(
-            f"{t.gaussians}", f"{t.width}x{t.height}", f"3+{t.channels}", f"{t.threads}", t.part,
-            f"{t.forward:.1f}", f"{t.backward:.1f}", f"{both:.1f}", f"{t.cpu:.1f}", *peer,
+def _print(rows: Sequence[KernelRow]) -> None:
+    lines = []
+    for r in rows:
+        peer = ("", "") if r.ratio is None else (f"{r.opensplat_ms:.0f}", f"{r.ratio:.1f}")
+        lines.append(
+            (
+                f"{r.job.gaussians:,}", f"{r.job.width}x{r.job.height}", f"3+{r.job.channels}",
+                f"{r.job.threads}", r.isa, r.job.part,
+                f"{r.forward.ms:.1f} [{r.forward.q1:.1f}, {r.forward.q3:.1f}]",
+                f"{r.backward.ms:.1f} [{r.backward.q1:.1f}, {r.backward.q3:.1f}]",
+                f"{r.forward.ms + r.backward.ms:.1f}", f"{r.forward.cpu + r.backward.cpu:.1f}", *peer,
+            )
         )  # fmt: skip
-    return table
-
-
-def write_csv(timings: Sequence[Timing], path: Path) -> None:
-    """One line per timing, columns named as the fields of `Timing`; comments say which machine and commit."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        file.writelines(f"# {key}: {value}\n" for key, value in machine().items())
-        file.write(
-            f"# commit: {commit()}\n# milliseconds, medians; opensplat is its published figure\n"
-        )
-        writer = csv.DictWriter(file, [f.name for f in fields(Timing)])
-        writer.writeheader()
-        writer.writerows(asdict(t) for t in timings)
+    columns = ("Gaussians", "image", "channels", "threads", "ISA", "part", "forward", "backward")
+    show(
+        "rasterizer, ms: median [quartiles] of wall clock; CPU sums over threads",
+        (*columns, "both", "CPU", "OpenSplat", "ratio"),
+        lines,
+    )

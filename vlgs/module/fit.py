@@ -34,6 +34,8 @@ class FitOptions:
     """JSON values that go into every checkpoint, e.g. the configuration."""
     progress: bool = True
     loggers: Sequence[Logger] = ()
+    callbacks: Sequence[L.Callback] = ()
+    """Called after those of training itself."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     ]
     if options.progress:
         callbacks.append(ProgressLine())
+    callbacks += options.callbacks
     with _expected_warnings():
         _trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
     return stop.stopped_by

@@ -1,0 +1,59 @@
+"""The subcommands run, and their files say what they hold."""
+
+from pathlib import Path
+
+import pytest
+
+from vlgs.bench.__main__ import SUBCOMMANDS, main
+from vlgs.bench.growth import Point, run_growth
+from vlgs.bench.kernel import Size, run_kernel
+from vlgs.bench.sheet import read_sheet
+
+HEADER = {"command", "cpu", "cores", "isa", "load", "commit", "seed", "torch"}
+TIMES = {f"{way}_{what}" for way in ("forward", "backward") for what in ("ms", "q1", "q3", "cpu")}
+
+
+def header(path: Path) -> set[str]:
+    lines = [line for line in path.read_text().splitlines() if line.startswith("# ")]
+    return {line[2:].partition(":")[0] for line in lines}
+
+
+def test_kernel_times_both_parts_and_the_reference(tmp_path: Path):
+    rows = run_kernel(
+        [Size(60, 32, 24, 1.0)], [Size(20, 16, 12)], [3, 5], [1], ["base"], 2, tmp_path
+    )
+    table = read_sheet(tmp_path / "kernel.csv")
+    assert header(tmp_path / "kernel.csv") >= HEADER
+    assert set(table) >= TIMES | {"job_threads", "isa", "repeats", "opensplat_ms", "ratio"}
+    assert list(table.job_part) == ["call", "blend"] * 2 + ["call", "reference"]
+    assert list(table.isa) == ["base"] * 5 + ["torch"]
+    assert (table.forward_ms > 0).all()
+    assert rows[0].ratio == pytest.approx(1.0 / (rows[0].forward.ms + rows[0].backward.ms))
+    assert table.opensplat_ms.notna().tolist() == [True, True, False, False, False, False]
+
+
+def test_growth_has_slopes_within_a_series(tmp_path: Path):
+    points = [Point("gaussians", n, n, 16, 12, 3, 1) for n in (20, 40)]
+    points += [Point("channels", c, 20, 16, 12, c, 1) for c in (1, 4)]
+    run_growth(points, 2, tmp_path, seed=0)
+    table = read_sheet(tmp_path / "growth.csv")
+    assert set(table) >= TIMES | {"point_axis", "point_value", "slope"}
+    assert table.slope.notna().tolist() == [False, True, False, True]
+    assert (tmp_path / "growth.png").stat().st_size > 0
+    assert (tmp_path / "growth.pdf").stat().st_size > 0
+
+
+def test_every_subcommand_says_what_it_does(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert all(subcommand.__name__ in text for subcommand in SUBCOMMANDS)
+
+
+def test_bad_input_is_one_line_and_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["pareto", "--out", str(tmp_path)]) == 1
+    assert "python -m vlgs.bench error makes it" in capsys.readouterr().err
+    assert main(["error", "--run", str(tmp_path)]) == 1
+    assert "must be a run folder with a checkpoint" in capsys.readouterr().err
+    assert main(["train", "--recipes", "soup", "--out", str(tmp_path)]) == 1
+    assert "recipe must be one of default" in capsys.readouterr().err

@@ -1,0 +1,65 @@
+"""Learning curves: written once, evaluation left out of the time."""
+
+from pathlib import Path
+
+import pytest
+
+from vlgs.bench import curve, train
+from vlgs.bench.curve import evaluated_at, seconds_to
+from vlgs.bench.presets import composed
+from vlgs.bench.sheet import read_sheet
+
+
+@pytest.mark.parametrize("label", train.RECIPES)
+def test_every_recipe_is_a_configuration(label: str):
+    composed(train.RECIPES[label])
+
+
+def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scenes = {"synthetic": (*train.QUICK, "trainer.iterations=6")}
+    rows = train.run_train(scenes, ["neither"], tmp_path, 2, 1, 0)
+    assert rows[0].iterations == 6
+    assert rows[0].seconds > 0
+    assert rows[0].psnr is not None
+    files = list((tmp_path / "train").glob("*.csv"))
+    assert len(files) == 1
+    table = read_sheet(files[0])
+    assert list(table.iteration) == [2, 6]
+    assert table.seconds.is_monotonic_increasing
+    assert set(table) >= {"cpu_seconds", "psnr", "miou", "gaussians"}
+    assert (tmp_path / "train.png").stat().st_size > 0
+
+    monkeypatch.setattr(train, "fit", lambda *_: pytest.fail("trained again"))
+    again = train.run_train(scenes, ["neither"], tmp_path, 2, 1, 0)
+    assert again[0].seconds == pytest.approx(rows[0].seconds, rel=1e-5)
+
+
+def test_evaluation_is_not_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    clock = iter(range(1000))
+    monkeypatch.setattr(curve.time, "perf_counter", lambda: float(next(clock)))
+    right = curve.score
+
+    def slow(trained):
+        for _ in range(100):
+            next(clock)
+        return right(trained)
+
+    monkeypatch.setattr(curve, "score", slow)
+    scenes = {"synthetic": (*train.QUICK, "trainer.iterations=4")}
+    rows = train.run_train(scenes, ["neither"], tmp_path, 4, 1, 0)
+    # The fake clock also ticks for TrainingClock, between the two readings of an iteration: 2 or 3 each, never 100.
+    assert rows[0].seconds <= 4 * 4
+
+
+def test_the_first_crossing_counts():
+    assert seconds_to(25.0, [10.0, 20.0, 30.0], [20.0, 30.0, 10.0]) == pytest.approx(15.0)
+    assert seconds_to(25.0, [10.0, 20.0], [26.0, 30.0]) == 10.0
+    assert seconds_to(31.0, [10.0, 20.0], [26.0, 30.0]) is None
+    assert seconds_to(None, [10.0], [26.0]) is None
+    assert seconds_to(1.0, [10.0, 20.0], [None, 2.0]) == 20.0
+
+
+def test_the_last_iteration_is_evaluated():
+    for iterations in (1, 7, 1500):
+        assert max(evaluated_at(iterations, 8)) == iterations
+        assert min(evaluated_at(iterations, 8)) >= 1

@@ -1,0 +1,221 @@
+"""Run time against error: presets, switches and precisions of the rasterizer against float64."""
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from vlgs.bench.checks import Check, check_dense, check_presets, check_rounding, violated
+from vlgs.bench.clock import Pass, Spread, spreads, take_turns
+from vlgs.bench.memory import Memory, measure_memory
+from vlgs.bench.outcome import Errors, Outcome, compare, outcome, time_render, without_cutoffs
+from vlgs.bench.presets import Trained, raster_presets
+from vlgs.bench.quality import Quality, measure_quality
+from vlgs.bench.scenes import in_precision, save_workload, view_of, with_one_weight
+from vlgs.bench.sheet import provenance, say, show, write_sheet
+from vlgs.bench.switches import check_switch, raster_switches
+from vlgs.bench.workload import Workload, make_workload
+from vlgs.types import RasterConfig
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+class Variant(NamedTuple):
+    """One way to render a scene."""
+
+    name: str
+    """A preset, or a switch that is not as ``default`` has it."""
+    group: str
+    """``preset`` or ``switch``."""
+    precision: str
+    threads: int
+    config: RasterConfig
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """One line of error.csv."""
+
+    scene: str
+    gaussians: int
+    width: int
+    height: int
+    variant: str
+    group: str
+    precision: str
+    threads: int
+    truth: str
+    """``no_cutoffs``: float64, nothing skipped, stopped or clamped. ``same_cutoffs``: float64 of the same variant."""
+    forward: Spread
+    backward: Spread
+    repeats: int
+    memory: Memory
+    error: Errors
+    quality: Quality
+    """Of the configuration in float32, as models are evaluated, whatever the precision of the row."""
+
+
+def make_scenes(
+    sizes: Sequence[tuple[int, int, int]], trained: Trained | None, seed: int
+) -> dict[str, Workload]:
+    """Workloads of these sizes, the first once more with one weight for both groups, and the first view of a trained scene."""
+    scenes: dict[str, Workload] = {}
+    for n, width, height in sizes:
+        count = f"{n // 1000}k" if n >= 1000 else f"{n}"
+        scenes[f"workload {count} {width}x{height}"] = make_workload(n, width, height, seed=seed)
+    first = next(iter(scenes), None)
+    if first is not None:
+        scenes[f"{first}, one weight"] = with_one_weight(make_workload(*sizes[0], seed=seed))
+    if trained is not None:
+        views = trained.scene.test or trained.scene.train
+        scenes[f"trained {trained.scene.name}"] = view_of(
+            trained.module.model, views[0].camera, seed
+        )
+    return scenes
+
+
+def run_error(
+    scenes: Mapping[str, Workload],
+    trained: Trained | None,
+    threads: Sequence[int],
+    repeats: int,
+    out: Path,
+    seed: int,
+) -> list[Check]:
+    """Measure every variant on every scene; write error.csv and error_checks.csv.
+
+    Returns:
+        The promises that were not kept.
+    """
+    header = provenance(
+        seed,
+        unit="milliseconds of wall clock (cpu: of all threads), MiB",
+        upstream="standard normal over the number of pixels; workload: its own",
+    )
+    presets = raster_presets()
+    checks = check_dense(presets, seed)
+    rows: list[ErrorRow] = []
+    for name, w in scenes.items():
+        say(f"{name} ...")
+        model = trained if name.startswith("trained") else None
+        rows += _measure(name, w, presets, threads, repeats, model)
+        checks += check_presets(name, w, presets) + check_rounding(name, w)
+        for switch in raster_switches():
+            checks += check_switch(name, w, switch)
+    write_sheet(out / "error.csv", rows, header)
+    write_sheet(out / "error_checks.csv", checks, header)
+    _print(rows)
+    print_checks(checks)
+    return violated(checks)
+
+
+def _variants(presets: Mapping[str, RasterConfig], threads: Sequence[int]) -> list[Variant]:
+    variants = [
+        Variant(name, "preset", precision, count, config)
+        for (name, config), precision, count in product(presets.items(), DTYPES, threads)
+    ]
+    for switch in raster_switches():
+        label, config = switch.turned(presets["default"])
+        variants.append(Variant(label, "switch", "float32", threads[0], config))
+    return variants
+
+
+def _measure(
+    name: str,
+    w: Workload,
+    presets: Mapping[str, RasterConfig],
+    threads: Sequence[int],
+    repeats: int,
+    trained: Trained | None,
+) -> Iterable[ErrorRow]:
+    variants = _variants(presets, threads)
+    copies = {precision: in_precision(w, dtype) for precision, dtype in DTYPES.items()}
+    timed: dict[Variant, Callable[[], Pass]] = {
+        v: partial(time_render, copies[v.precision], v.config, v.threads) for v in variants
+    }
+    samples = take_turns(timed, repeats)
+    memory = _memories(copies, variants)
+    truth: dict[RasterConfig, Outcome] = {}
+    qualities: dict[RasterConfig, Quality] = {}
+    rows = []
+    for v in variants:
+        got = outcome(copies[v.precision], v.config)
+        if v.config not in qualities:
+            qualities[v.config] = measure_quality(trained, v.config, presets["exact"])
+        forward, backward = spreads(samples[v])
+        for label, config in (
+            ("no_cutoffs", without_cutoffs(v.config)),
+            ("same_cutoffs", v.config),
+        ):
+            if config not in truth:
+                truth[config] = outcome(copies["float64"], config)
+            c = w.camera
+            rows.append(
+                ErrorRow(
+                    name, len(w.means), c.width, c.height, *v[:4], label, forward, backward,
+                    repeats, memory[v], compare(got, truth[config]), qualities[v.config],
+                )
+            )  # fmt: skip
+    return rows
+
+
+def _memories(copies: Mapping[str, Workload], variants: Sequence[Variant]) -> dict[Variant, Memory]:
+    """Each variant in a process of its own, which does nothing else."""
+    memories: dict[Variant, Memory] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for precision, w in copies.items():
+            save_workload(Path(folder) / f"{precision}.safetensors", w)
+        for v in variants:
+            path = Path(folder) / f"{v.precision}.safetensors"
+            memories[v] = measure_memory(path, v.config, v.threads)
+    return memories
+
+
+def _print(rows: Sequence[ErrorRow]) -> None:
+    for scene in dict.fromkeys(row.scene for row in rows):
+        lines = []
+        for r in (r for r in rows if r.scene == scene):
+            if r.truth != "no_cutoffs":
+                continue
+            same = next(
+                s for s in rows
+                if s.truth == "same_cutoffs"
+                and (s.scene, s.variant, s.precision, s.threads)
+                == (r.scene, r.variant, r.precision, r.threads)
+            )  # fmt: skip
+            quality = [
+                "" if value is None else f"{value:.{digits}f}"
+                for value, digits in ((r.quality.psnr, 3), (r.quality.miou, 4))
+            ]
+            lines.append(
+                (
+                    r.variant, r.precision, f"{r.threads}", f"{r.forward.ms:.1f}", f"{r.backward.ms:.1f}",
+                    f"{r.forward.cpu + r.backward.cpu:.1f}", f"{r.memory.extra_mib:.0f}",
+                    f"{r.error.image_max:.1e}", f"{r.error.image_mean:.1e}", f"{r.error.gradient:.1e}",
+                    f"{same.error.image_max:.1e}", f"{same.error.gradient:.1e}", *quality,
+                )
+            )  # fmt: skip
+        columns = ("variant", "precision", "threads", "forward", "backward", "CPU", "+MiB")
+        errors = ("max", "mean", "gradient", "max, same", "gradient, same")
+        show(
+            f"{scene}: ms (median wall; CPU of all threads), errors against float64 without cut-offs and with the same",
+            (*columns, *errors, "PSNR", "mIoU"),
+            lines,
+        )
+
+
+def print_checks(checks: Sequence[Check]) -> None:
+    """Promise, figure, bound, and whether it holds."""
+    show(
+        "promises",
+        ("scene", "promise", "measured", "bound", "holds"),
+        [
+            (c.scene, c.promise, f"{c.measured:.2e}", f"{c.bound:.2e}", "yes" if c.holds else "NO")
+            for c in checks
+        ],
+    )

@@ -1,0 +1,244 @@
+"""Time to reach a score: one learning curve per preset and schedule, on a procedural and a real scene."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+import torch
+
+from vlgs.bench.curve import Curve, CurvePoint, curve_path, evaluated_at, seconds_to
+from vlgs.bench.presets import Trained, build, composed
+from vlgs.bench.sheet import (
+    COLORS,
+    STYLE,
+    plain_ticks,
+    provenance,
+    read_sheet,
+    say,
+    show,
+    write_figure,
+    write_sheet,
+)
+from vlgs.config import instantiate, run_id
+from vlgs.module.fit import FitOptions, fit
+from vlgs.module.state import RESULTS_VERSION
+from vlgs.runs import RunFolder
+from vlgs.skips import SKIPS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BASE = ("codec.cache_dir=null",)
+
+
+def _skips(on: bool) -> tuple[str, ...]:
+    """Every switch that loses nothing, or no more than its bound, turned on; or every one turned off."""
+    chosen: dict[str, str] = {}
+    for skip in SKIPS:
+        if skip.switchable and (
+            not on or (skip.kind != "statistical" and skip.name != "early_stop")
+        ):
+            chosen[skip.setting] = skip.override(on)
+    return tuple(chosen.values())
+
+
+RECIPES: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "exact": ("raster=exact",),
+    "fast": ("raster=fast",),
+    "no blend": ("blend=none",),
+    "no fusion": ("fusion=none",),
+    "neither": ("blend=none", "fusion=none"),
+    "neither, fast": ("blend=none", "fusion=none", "raster=fast"),
+    "all skips": _skips(on=True),
+    "no skips": _skips(on=False),
+    "short": ("trainer.iterations=500", "trainer.sh_every=100", "gaussians.densify.start=100", "gaussians.densify.stop=350"),
+    "photos": ("trainer=photos",),
+}  # fmt: skip
+"""Label -> overrides of `python -m vlgs.run`."""
+
+QUICK = ("data.width=48", "data.height=36", "data.train_views=6", "data.test_views=2", "data.points=400",
+         "codec.training.steps=30", "trainer=smoke")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One line of train.csv."""
+
+    scene: str
+    label: str
+    overrides: str
+    iterations: int
+    seconds: float
+    """Wall clock of all iterations."""
+    cpu_seconds: float
+    psnr: float | None
+    miou: float | None
+    gaussians: int
+    psnr_target: float | None
+    seconds_to_psnr: float | None
+    cpu_to_psnr: float | None
+    miou_target: float | None
+    seconds_to_miou: float | None
+    cpu_to_miou: float | None
+
+
+def scene_overrides(root: Path | None, resize: float, quick: bool) -> dict[str, tuple[str, ...]]:
+    """Procedural always; the photographs at `root` where one is given."""
+    scenes: dict[str, tuple[str, ...]] = {"synthetic": QUICK if quick else ()}
+    if root is None:
+        say("no photographs (--root SCENE): the procedural scene alone")
+    else:
+        photographs = ("data=colmap", f"data.root={root}", f"data.resize={resize}")
+        scenes["photographs"] = (*photographs, *(QUICK[-1:] if quick else ()))
+    return scenes
+
+
+def run_train(
+    scenes: dict[str, tuple[str, ...]],
+    labels: Sequence[str],
+    out: Path,
+    points: int,
+    threads: int,
+    seed: int,
+    targets: tuple[float | None, float | None] = (None, None),
+) -> list[Summary]:
+    """Train what has no curve yet; write train.csv and train.png, print the table.
+
+    A curve is written when its training ends and is not trained again: its file is named after the run id, so that a change of
+    configuration, data or results version gives a new one. Without targets they are 1 dB and 0.02 below the end of ``default``
+    (of the first label where it is not among them).
+    """
+    header = provenance(seed, unit="seconds of training, evaluation and set-up not counted")
+    found = {}
+    for extra in scenes.values():
+        for label in labels:
+            curve = _curve(label, (*extra, *RECIPES[label]), out, points, threads, seed)
+            found[str(curve.scene.iloc[0]), label] = curve
+    rows = _summaries(found, targets)
+    write_sheet(out / "train.csv", rows, header)
+    draw_train(out / "train", found)
+    _print(rows)
+    return rows
+
+
+def _curve(
+    label: str, overrides: Sequence[str], out: Path, points: int, threads: int, seed: int
+) -> pd.DataFrame:
+    config = composed([*BASE, *overrides, f"seed={seed}", f"threads={threads}", "progress=false"])
+    torch.set_num_threads(threads)
+    scene = instantiate(config.data)
+    path = curve_path(out / "train", scene.name, run_id(config, scene.fingerprint, RESULTS_VERSION))
+    if path.is_file():
+        say(f"{scene.name}, {label}: {path} is there")
+        return read_sheet(path).assign(label=label)
+    say(f"{scene.name}, {label}: {config.trainer.iterations} iterations ...")
+    header = provenance(seed, overrides=" ".join(overrides), training_threads=threads)
+    trained = Trained(config, scene, build(config, scene))
+    curve = Curve(trained, label, evaluated_at(config.trainer.iterations, points))
+    with tempfile.TemporaryDirectory() as folder:
+        options = FitOptions(meta={}, progress=False, callbacks=[curve])
+        if fit(trained.module, RunFolder(Path(folder)), options) is not None:
+            raise KeyboardInterrupt
+    write_sheet(path, curve.points, header)
+    return _frame(curve.points)
+
+
+def _frame(points: Sequence[CurvePoint]) -> pd.DataFrame:
+    return pd.DataFrame([vars(point) for point in points])
+
+
+def _values(curve: pd.DataFrame, column: str) -> list[float | None]:
+    return [None if pd.isna(v) else float(v) for v in curve[column]]
+
+
+def _summaries(
+    curves: dict[tuple[str, str], pd.DataFrame], targets: tuple[float | None, float | None]
+) -> list[Summary]:
+    rows = []
+    for scene in dict.fromkeys(scene for scene, _ in curves):
+        mine = {label: curve for (where, label), curve in curves.items() if where == scene}
+        model = mine.get("default", next(iter(mine.values())))
+        psnr, miou = (
+            target if target is not None or last is None else last - slack
+            for target, last, slack in (
+                (targets[0], _values(model, "psnr")[-1], 1.0),
+                (targets[1], _values(model, "miou")[-1], 0.02),
+            )
+        )
+        for label, curve in mine.items():
+            wall, cpu = list(curve.seconds), list(curve.cpu_seconds)
+            psnrs, mious = _values(curve, "psnr"), _values(curve, "miou")
+            rows.append(
+                Summary(
+                    scene, label, " ".join(RECIPES[label]), int(curve.iteration.iloc[-1]), wall[-1], cpu[-1],
+                    psnrs[-1], mious[-1], int(curve.gaussians.iloc[-1]),
+                    psnr, seconds_to(psnr, wall, psnrs), seconds_to(psnr, cpu, psnrs),
+                    miou, seconds_to(miou, wall, mious), seconds_to(miou, cpu, mious),
+                )
+            )  # fmt: skip
+    return rows
+
+
+def draw_train(stem: Path, curves: dict[tuple[str, str], pd.DataFrame]) -> None:
+    """PSNR and mIoU against seconds of training, one row per scene."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(scene for scene, _ in curves))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 2.9 * len(scenes)), layout="constrained")
+        panels = figure.subplots(len(scenes), 2, squeeze=False)
+        for scene, line in zip(scenes, panels, strict=True):
+            mine = {label: curve for (where, label), curve in curves.items() if where == scene}
+            for panel, column, name in zip(
+                line, ("psnr", "miou"), ("PSNR, dB", "mIoU"), strict=True
+            ):
+                _draw_curves(panel, mine, column)
+                panel.set_ylabel(f"{name}, held-out views")
+                panel.set_title(scene, fontsize=8)
+            line[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        write_figure(stem, figure)
+
+
+def _draw_curves(panel: "Axes", curves: dict[str, pd.DataFrame], column: str) -> None:
+    styles = ("-", "--")
+    for i, (label, curve) in enumerate(curves.items()):
+        color, style = COLORS[i % len(COLORS)], styles[i // len(COLORS) % 2]
+        panel.plot(
+            curve.seconds,
+            curve[column],
+            marker="o",
+            ms=2.5,
+            lw=1,
+            ls=style,
+            color=color,
+            label=label,
+        )
+    panel.set_xscale("log")
+    plain_ticks(panel.xaxis)
+    panel.set_xlabel("seconds of training (wall clock, evaluation not counted)")
+
+
+def _print(rows: Sequence[Summary]) -> None:
+    def number(value: float | None, digits: int) -> str:
+        return "--" if value is None else f"{value:.{digits}f}"
+
+    lines = [
+        (
+            r.scene, r.label, f"{r.iterations}", f"{r.seconds:.1f}", f"{r.cpu_seconds:.1f}", f"{r.gaussians:,}",
+            number(r.psnr, 2), number(r.miou, 3), number(r.seconds_to_psnr, 1), number(r.cpu_to_psnr, 1),
+            number(r.seconds_to_miou, 1), number(r.cpu_to_miou, 1),
+        )
+        for r in rows
+    ]  # fmt: skip
+    columns = ("scene", "recipe", "iterations", "s", "CPU s", "Gaussians", "PSNR", "mIoU")
+    to = ("s to PSNR", "CPU", "s to mIoU", "CPU")
+    show("training: seconds in all and to the targets", (*columns, *to), lines)
+    for scene in dict.fromkeys(r.scene for r in rows):
+        row = next(r for r in rows if r.scene == scene)
+        goals = f"PSNR {number(row.psnr_target, 2)} dB, mIoU {number(row.miou_target, 3)}"
+        say(f"targets on {scene}: {goals}")
