@@ -176,9 +176,9 @@ VLGS_INLINE Pack<float> exp2_of_minus(const Pack<float> &x) {
   p = fma(p, r, splat(0x1.ebf9bcp-3f));
   p = fma(p, r, splat(0x1.62e42ap-1f));
   p = fma(p, r, splat(1.0f));
-  using Int = NativeOf<float>::Int;
+  typedef uint32_t Bits __attribute__((vector_size(kNativeBytes)));  // may wrap round in the other lanes
   for (int i = 0; i < Pack<float>::kParts; ++i)
-    p.part[i] = (Pack<float>::Native)((Int)p.part[i] + ((Int)shifted.part[i] << 23));
+    p.part[i] = (Pack<float>::Native)((Bits)p.part[i] + ((Bits)shifted.part[i] << 23));
   return p;
 }
 #endif

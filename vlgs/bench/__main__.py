@@ -140,15 +140,15 @@ def iteration(parser: ArgumentParser) -> Runner:
 
     def run(args: Namespace) -> int:
         import torch
+        from rich.console import Console
 
         from vlgs.bench.iteration import SIZES, measure_iteration, show_iterations
-        from vlgs.bench.sheet import say
 
         torch.set_num_threads(args.threads)
         chosen = [0] if args.quick else args.sizes or range(len(SIZES))
         count = 3 if args.quick else args.iterations
         measured = [(SIZES[i], measure_iteration(SIZES[i], count)) for i in chosen]
-        say(show_iterations(measured))
+        Console().print(show_iterations(measured))
         return 0
 
     return run
@@ -161,12 +161,59 @@ def protocols(parser: ArgumentParser) -> Runner:
     parser.add_argument("--size", type=int, nargs=2, default=(986, 728), metavar=("W", "H"))
 
     def run(args: Namespace) -> int:
+        from rich.console import Console
+
         from vlgs.bench.protocols import measure_protocols, show_protocols
-        from vlgs.bench.sheet import say
 
         queries, size = (2, (64, 48)) if args.quick else (args.queries, args.size)
-        say(show_protocols(measure_protocols(queries, args.levels, *size)))
+        Console().print(show_protocols(measure_protocols(queries, args.levels, *size)))
         return 0
+
+    return run
+
+
+def stress(parser: ArgumentParser) -> Runner:
+    """Hostile input, case by case: criterion, measured, passed; 1 if one failed."""
+    parser.add_argument("--only", nargs="+", default=[], metavar="CASE", help="names or parts")
+
+    def run(args: Namespace) -> int:
+        from rich.console import Console
+
+        from vlgs.bench import stress as cases_of
+
+        cases = [
+            case
+            for case in cases_of.CASES
+            if not args.only or any(part in case.name for part in args.only)
+        ]
+        if not cases:
+            raise ValueError(f"stress: --only must match a case, got {' '.join(args.only)}")
+        console, results = Console(), []
+        for result in cases_of.run_cases(cases, full=not args.quick):
+            results.append(result)
+            case, verdict, seconds = result
+            word = "passed" if verdict.passed else "FAILED"
+            console.print(f"{case.name}: {word} in {seconds:.1f} s")
+        console.print(cases_of.show_table(results), width=max(console.width, 140))
+        if not args.only:  # a part of the cases never replaces the file of all
+            cases_of.write_csv(results, args.out / "stress.csv")
+        return int(any(not verdict.passed for _, verdict, _ in results))
+
+    return run
+
+
+def fuzz(parser: ArgumentParser) -> Runner:
+    """Random hostile scenes through the rasterizer; 1 if one was answered wrongly."""
+    parser.add_argument("--scenes", type=int, default=10_000)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.fuzz import fuzz as run_fuzz
+
+        count = 20 if args.quick else args.scenes
+        report = run_fuzz(range(args.first, args.first + count))
+        print(report)
+        return int(bool(report.failures))
 
     return run
 
@@ -180,6 +227,8 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     overhead,
     iteration,
     protocols,
+    stress,
+    fuzz,
 )
 """Name, help and options of a subcommand are those of its function; `all` runs them in this order."""
 

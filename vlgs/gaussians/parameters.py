@@ -55,19 +55,22 @@ def logit(probability: float) -> float:
 
 
 class _Logistic(torch.autograd.Function):
-    """1 / (1 + exp(-x)), whose bits do not depend on the number of threads: those of `torch.sigmoid` do (torch 2.13)."""
+    """1 / (1 + exp(-x)), whose bits do not depend on the number of threads: those of `torch.sigmoid` do (torch 2.13).
+
+    Its slope is not y (1 - y), which is 0 in float32 from x = 17 on and would hold a Gaussian at 1 for ever.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = x.neg().exp_().add_(1).reciprocal_()
-        ctx.save_for_backward(y)
-        return y
+        ctx.save_for_backward(x)
+        return x.neg().exp_().add_(1).reciprocal_()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_y: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (y,) = ctx.saved_tensors
-        return d_y * y * (1 - y)
+        (x,) = ctx.saved_tensors
+        falloff = x.abs().neg_().exp_()  # the slope is even in x
+        return d_y * falloff / (1 + falloff).square_()
 
 
 def _logistic(x: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from vlgs.module.callbacks import (
 from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.state import restore
+from vlgs.module.stuck import StuckAlarm
 from vlgs.runs import RunFolder
 
 log = logging.getLogger(__name__)
@@ -72,6 +73,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     stop = GracefulStop()
     callbacks: list[L.Callback] = [
         TrainingClock(),
+        StuckAlarm(module.settings.log_every),
         Densification(),
         CurveLog(folder.curves, module.settings.log_every),
         Checkpoints(folder.checkpoint, module.settings.checkpoint_every, options.meta),

@@ -113,7 +113,20 @@ class VLGSModule(L.LightningModule):
         return self.optimizer
 
     def training_step(self, step: int, batch_idx: int) -> None:
-        """One iteration; `step` counts from 0 over the whole run, resumed or not."""
+        """One iteration; `step` counts from 0 over the whole run, resumed or not.
+
+        Raises:
+            FloatingPointError: If the loss or a gradient is not finite; tensor, row, step and views are named.
+            ValueError: If the rasterizer refuses a number; likewise.
+        """
+        views = " and ".join(self.scene.train[index].name for index in self.sampler.pair(step))
+        where = f"in step {step} with views {views}"
+        try:
+            self._step(step, where)
+        except ValueError as error:
+            raise ValueError(f"{error} {where}") from error
+
+    def _step(self, step: int, where: str) -> None:
         self._set_schedule(step)
         pair = self.sampler.pair(step)
         first, second = targets = self.target(pair[0]), self.target(pair[1])
@@ -127,7 +140,6 @@ class VLGSModule(L.LightningModule):
         if plan is not None:
             total = total + self._blended_loss(plan, targets, renders, fused)
         views = (first.view.name, second.view.name)
-        where = f"in step {step} with views {' and '.join(views)}"
         if not torch.isfinite(total):
             raise FloatingPointError(f"train: loss must be finite, got {total.item()} {where}")
         self.optimizer.zero_grad(set_to_none=True)

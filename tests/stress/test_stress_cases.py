@@ -1,0 +1,36 @@
+"""Every stress case at a small size; `python -m vlgs.bench stress` runs the same list at 10^4 to 10^6."""
+
+from pathlib import Path
+
+import pytest
+
+from vlgs.bench import stress
+from vlgs.bench.stress.case import Case, Verdict
+
+
+@pytest.mark.parametrize("case", stress.CASES, ids=lambda case: case.name)
+def test_case(case: Case):
+    verdict = case.run(False)
+    assert verdict.passed, f"{case.criterion}\nmeasured: {verdict.measured}"
+
+
+def test_every_known_failure_has_a_case_and_every_case_a_criterion():
+    numbers = {int(case.name[1:].split()[0]) for case in stress.CASES}
+    assert numbers == set(range(1, 20))
+    assert all(case.criterion for case in stress.CASES)
+
+
+def test_a_failure_and_an_exception_are_failures(tmp_path: Path):
+    def fails(full: bool) -> Verdict:
+        """Never."""
+        return Verdict("7 (<= 3)", False)
+
+    def breaks(full: bool) -> Verdict:
+        """Never."""
+        raise RuntimeError("no")
+
+    results = list(stress.run_cases([Case("N1 a", fails), Case("N2 b", breaks)], full=False))
+    assert [verdict.passed for _, verdict, _ in results] == [False, False]
+    assert stress.show_table(results).row_count == 2
+    stress.write_csv(results, tmp_path / "out" / "stress.csv")
+    assert "RuntimeError: no" in (tmp_path / "out" / "stress.csv").read_text()

@@ -1,0 +1,71 @@
+"""The fuzzer itself: scenes are functions of their seed, and what it must catch it catches."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from vlgs.bench import fuzz
+from vlgs.bench.fuzz import FuzzScene, make_scene, run_scene
+from vlgs.types import ChannelGroup
+
+
+def test_a_scene_is_a_function_of_its_seed():
+    for seed in range(20):
+        a, b = make_scene(seed), make_scene(seed)
+        assert a.tensors.keys() == b.tensors.keys()
+        for name in a.tensors:
+            assert torch.equal(a.tensors[name].nan_to_num(7), b.tensors[name].nan_to_num(7))
+
+
+def test_scenes_differ_in_everything_that_matters():
+    scenes = [make_scene(seed) for seed in range(300)]
+    assert {len(scene.chain_of) for scene in scenes} == {1, 2, 3, 4, 5}
+    assert {scene.tensors["means"].dtype for scene in scenes} == {torch.float32, torch.float64}
+    assert {scene.config.stop for scene in scenes} == {"after", "before"}
+    assert {0, 1} < {len(scene.tensors["means"]) for scene in scenes}
+    assert any(len(set(s.chain_of)) < len(s.chain_of) for s in scenes)
+    assert {scene.tame for scene in scenes} == {True, False}
+    channels = {s.tensors[f"values{i}"].shape[1] for s in scenes for i in range(len(s.chain_of))}
+    assert channels == set(range(1, 41))
+
+
+def first_tame() -> FuzzScene:
+    return next(s for s in map(make_scene, range(100)) if s.tame and len(s.tensors["means"]) > 2)
+
+
+def test_a_refused_tame_scene_is_a_failure():
+    scene = first_tame()
+    scene.tensors["means"][0, 0] = torch.nan
+    with pytest.raises(AssertionError, match="a tame scene was refused: rasterize: means must be"):
+        run_scene(scene)
+    assert "means must be finite" in (run_scene(replace(scene, tame=False)) or "")
+
+
+@pytest.mark.parametrize(
+    ("answer", "caught"),
+    [(ValueError("went wrong"), "error without a name"), (RuntimeError("x"), "RuntimeError: x")],
+)
+def test_other_errors_are_failures_of_their_seed(
+    monkeypatch: pytest.MonkeyPatch, answer: Exception, caught: str
+):
+    def broken(*args: object) -> None:
+        raise answer
+
+    monkeypatch.setattr(fuzz, "rasterize", broken)
+    report = fuzz.fuzz([3])
+    assert list(report.failures) == [3]
+    assert caught in str(report)
+
+
+def test_numbers_that_are_not_finite_are_failures(monkeypatch: pytest.MonkeyPatch):
+    real = fuzz.rasterize
+
+    def poisoned(means, quats, scales, groups, *rest):
+        bad = [ChannelGroup(group.values, group.weight) for group in groups]
+        out = real(means, quats, scales, bad, *rest)
+        return replace(out, images=(out.images[0] + torch.inf, *out.images[1:]))
+
+    monkeypatch.setattr(fuzz, "rasterize", poisoned)
+    seed = next(seed for seed in range(100) if make_scene(seed).tame)
+    assert "picture 0 is not finite" in str(fuzz.fuzz([seed]))

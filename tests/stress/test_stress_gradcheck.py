@@ -1,0 +1,289 @@
+"""Finite differences in float64 for every differentiable function of the package; a new one must join a list to pass.
+
+The functions are found, not remembered: whatever is public and returns floating tensors is either differentiated here or
+stands among those without a gradient, with the reason. Inputs keep away from cutoffs, where a central difference fails.
+"""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from vlgs.bench.stress.splats import SMOOTH, make_splats
+from vlgs.blend import FixedBlend, blend_targets
+from vlgs.blend.pose import slerp
+from vlgs.codec.autoencoder import Autoencoder
+from vlgs.codec.identity import Identity
+from vlgs.fusion.attention import CrossAttention, SelfAttention, channel_attention
+from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
+from vlgs.fusion.mlp import MLP
+from vlgs.gaussians.parameters import activate
+from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color_residual
+from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
+from vlgs.indicator import ColourOpacity, Learned
+from vlgs.losses import Losses, l1_dssim, masked_cosine, masked_l1, masked_mse, ssim, ssim_map
+from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
+from vlgs.query.similarity import cosines, decoded_cosines
+from vlgs.render import rasterize
+from vlgs.render.model import SplatModel
+from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
+
+AREAS = ("render", "losses", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+
+NO_GRADIENT = {
+    "vlgs.fusion.Fusion.__call__": "protocol",
+    "vlgs.codec.Codec.encode": "protocol",
+    "vlgs.codec.Codec.decode": "protocol",
+    "vlgs.query.Query.relevancy": "protocol",
+    "vlgs.query.Query.__call__": "protocol",
+    "vlgs.query.text.TextEncoder.encode": "protocol",
+    "vlgs.indicator.Indicator.__call__": "protocol",
+    "vlgs.fusion.none.NoFusion.forward": "returns its arguments",
+    "vlgs.indicator.Fixed.__call__": "a constant",
+    "vlgs.gaussians.densify.DensifyState.mean": "a statistic",
+    "vlgs.gaussians.init.initialise": "placed once",
+    "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
+    "vlgs.gaussians.ply.read_ply": "from a file",
+    "vlgs.query.text.VocabularyText.encode": "takes words",
+    "vlgs.query.text.ClipText.encode": "takes words",
+}
+
+Check = tuple[Callable[..., object], list[Tensor]]
+
+
+def draw(*shape: int, seed: int = 0, low: float = -1.0, high: float = 1.0) -> Tensor:
+    rng = torch.Generator().manual_seed(seed)
+    return torch.rand(*shape, generator=rng, dtype=torch.float64) * (high - low) + low
+
+
+VALID = torch.tensor([[True, False, True, True]] * 3)
+SIZE = (3, 4, 2)
+LAYER = torch.nn.Linear(2, 3).double().requires_grad_(False)
+
+
+def rasterizing(backend: str, outside: bool) -> Check:
+    """Two groups of their own, one that shares a chain, one that leaves the shape alone; inside or outside the clamp."""
+    s = make_splats(5, seed=2, size=(6, 5), channels=(2, 1)).to(torch.float64)
+    if outside:
+        far = torch.tensor([[6.0, 0.2], [-6, 0.1], [0.3, 6], [-0.2, -6], [5, -5]]).double()
+        s = replace(s, means=torch.cat([far, s.means[:, 2:]], 1), scales=s.scales + 2.5)
+    K = torch.tensor([[6.0, 0, 2.5], [0, 7, 3], [0, 0, 1]]).double()
+
+    def images(
+        means: Tensor, quats: Tensor, scales: Tensor, w0: Tensor, w1: Tensor, f0: Tensor, f1: Tensor
+    ):
+        groups = [ChannelGroup(f0, w0), ChannelGroup(f1, w1), ChannelGroup(f1, w0)]
+        out = rasterize(means, quats, scales, groups, torch.eye(4), K, 6, 5, SMOOTH, backend)  # pyright: ignore
+        return (*out.images, *out.alphas, out.mean2d)
+
+    weights = [0.9 * w for w in s.weights]
+    return images, [s.means, s.quats, s.scales, *weights, *s.values]
+
+
+def shape_alone() -> Check:
+    """Without its gradient on the shape, a group's values and weights keep theirs."""
+    s = make_splats(5, seed=2, size=(6, 5), channels=(2,)).to(torch.float64)
+
+    def image(weight: Tensor, values: Tensor):
+        group = ChannelGroup(values, weight, shape_grad=False)
+        means = s.means.clone().requires_grad_()
+        out = rasterize(means, s.quats, s.scales, [group], torch.eye(4), K, 6, 5, SMOOTH)
+        return out.images[0], out.alphas[0]
+
+    K = torch.tensor([[6.0, 0, 2.5], [0, 7, 3], [0, 0, 1]]).double()
+    return image, [0.9 * s.weights[0], s.values[0]]
+
+
+def parameters() -> dict[str, Tensor]:
+    s = make_splats(4, seed=3, size=(6, 5)).to(torch.float64)
+    return {
+        "means": s.means, "quats": s.quats, "log_scales": s.scales.log(), "sh0": draw(4, 3, seed=1),
+        "shN": 0.1 * draw(4, 15, 3, seed=2), "opacity_logits": draw(4, seed=3),
+        "indicator_logits": draw(4, seed=4), "features": draw(4, 3, seed=5),
+    }  # fmt: skip
+
+
+def activated(*values: Tensor) -> Gaussians:
+    return activate(dict(zip(parameters(), values, strict=True)))
+
+
+def model(read: Callable[[SplatModel], object]) -> Check:
+    """A method of the model as a function of its parameters."""
+    whole = SplatModel(
+        parameters(), SelfAttention(3, 3, init="xavier").double(), Learned(), Identity(3), SMOOTH, 3
+    )
+
+    def run(*values: Tensor):
+        # Module attributes only take Parameters; a plain mapping serves here.
+        del whole.splats
+        whole.splats = dict(zip(parameters(), values, strict=True))  # pyright: ignore
+        return read(whole)
+
+    return run, list(parameters().values())
+
+
+def view() -> Camera:
+    K = torch.tensor([[6.0, 0, 2.5], [0, 7, 3], [0, 0, 1]]).double()
+    return Camera(torch.eye(4).double(), K, 6, 5)
+
+
+def fuse(module: torch.nn.Module) -> Check:
+    """Inputs and every weight."""
+    module = module.double()
+    names = [name for name, _ in module.named_parameters()]
+
+    def run(color: Tensor, feature: Tensor, *weights: Tensor):
+        return torch.func.functional_call(
+            module, dict(zip(names, weights, strict=True)), (color, feature)
+        )
+
+    return run, [draw(3, 2), draw(3, 2, seed=1), *(p.detach() for p in module.parameters())]
+
+
+def codec() -> Autoencoder:
+    made = Autoencoder(dim=3, encoder_widths=(8, 6), decoder_widths=(6, 8))
+    torch.manual_seed(0)
+    made.build(5)
+    made.requires_grad_(False)
+    return made.double()
+
+
+def both(loss: Callable[..., Tensor], *rest: object) -> Check:
+    """A loss as a function of the render; the target differs from it everywhere."""
+    return lambda render: loss(render, 2 + draw(*SIZE, seed=9), *rest), [draw(*SIZE)]
+
+
+rotation = quat_to_rotmat(draw(4, 4, seed=4))
+CHECKS: dict[str, Callable[[], Check]] = {
+    "vlgs.render.rasterize.rasterize": lambda: rasterizing("cpu", False),
+    "vlgs.render.rasterize.rasterize outside the clamp": lambda: rasterizing("cpu", True),
+    "vlgs.render.rasterize.rasterize shape_grad off": shape_alone,
+    "vlgs.render.cpu.rasterize": lambda: rasterizing("cpu", False),
+    "vlgs.render.cpu.blend": lambda: rasterizing("cpu", False),
+    "vlgs.render.cpu.project": lambda: rasterizing("cpu", True),
+    "vlgs.render.reference.rasterize": lambda: rasterizing("reference", False),
+    "vlgs.render.model.SplatModel.gaussians": lambda: model(
+        lambda m: tuple(vars(m.gaussians()).values())
+    ),
+    "vlgs.render.model.SplatModel.fuse": lambda: model(lambda m: (m.fuse().color, m.fuse().feature)),
+    "vlgs.render.model.SplatModel.render": lambda: model(
+        lambda m: (m.render(view()).color, m.render(view()).feature)
+    ),
+    "vlgs.render.model.SplatModel.render_values": lambda: model(
+        lambda m: m.render_values(view(), m.splats["features"], m.gaussians().indicators)
+    ),
+    "vlgs.losses.masked_mse": lambda: both(masked_mse, VALID),
+    "vlgs.losses.masked_l1": lambda: both(masked_l1, VALID),
+    "vlgs.losses.masked_cosine": lambda: both(masked_cosine, VALID),
+    "vlgs.losses.ssim": lambda: (ssim, [draw(*SIZE), draw(*SIZE, seed=1)]),
+    "vlgs.losses.ssim_map": lambda: (ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),
+    "vlgs.losses.l1_dssim": lambda: both(l1_dssim, VALID),
+    "vlgs.losses.Losses.color_loss": lambda: (
+        lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
+    ),
+    "vlgs.losses.Losses.language_loss": lambda: both(Losses(lang_loss="cos").language_loss, VALID),
+    "vlgs.losses.Losses.blended_loss": lambda: both(Losses().blended_loss, VALID, 0.7),
+    "vlgs.geometry.quat_to_rotmat": lambda: (quat_to_rotmat, [draw(4, 4)]),
+    "vlgs.geometry.rotmat_to_quat": lambda: (rotmat_to_quat, [rotation]),
+    "vlgs.geometry.camera_center": lambda: (camera_center, [draw(2, 4, 4)]),
+    "vlgs.geometry.pose_matrix": lambda: (pose_matrix, [rotation, draw(4, 3)]),
+    "vlgs.blend.pose.slerp": lambda: (slerp, [draw(4, 4), draw(4, 4, seed=1), draw(4, low=0.1, high=0.9)]),
+    "vlgs.blend.target.blend_targets": lambda: (
+        lambda a, b: blend_targets(a, VALID, b, VALID.flip(1), 0.3, FixedBlend(value=0.3, mask="or"))[0],
+        [draw(*SIZE), draw(*SIZE, seed=1)],
+    ),
+    "vlgs.fusion.attention.channel_attention": lambda: (
+        channel_attention, [draw(2, 3, 1, 2, 2, seed=i) for i in range(3)]
+    ),
+    "vlgs.fusion.attention.SelfAttention.forward": lambda: fuse(SelfAttention(2, 2, 2, init="xavier")),
+    "vlgs.fusion.attention.CrossAttention.forward": lambda: fuse(CrossAttention(2, 2, 2, init="xavier")),
+    "vlgs.fusion.mlp.MLP.forward": lambda: fuse(MLP(2, 2, residual=False)),
+    "vlgs.fusion.blocks.to_blocks": lambda: (lambda x: to_blocks(x)[:, :, :3], [draw(3, 2)]),
+    "vlgs.fusion.blocks.from_blocks": lambda: (lambda x: from_blocks(x.expand(2, 2, BLOCK), 3), [draw(2, 2, 1)]),
+    "vlgs.fusion.blocks.linear": lambda: (partial(linear, LAYER), [draw(2, 2, 4)]),
+    "vlgs.gaussians.parameters.activate": lambda: (
+        lambda *v: tuple(vars(activated(*v)).values()), list(parameters().values())
+    ),
+    "vlgs.gaussians.sh.sh_to_rgb": lambda: (sh_to_rgb, [draw(4, 3)]),
+    "vlgs.gaussians.sh.rgb_to_sh": lambda: (rgb_to_sh, [draw(4, 3)]),
+    "vlgs.gaussians.sh.view_color_residual": lambda: (
+        lambda s, d: view_color_residual(s, d, 3), [draw(2, 15, 3), draw(2, 3, seed=1)]
+    ),
+    "vlgs.codec.autoencoder.Autoencoder.encode": lambda: (codec().encode, [draw(3, 5)]),
+    "vlgs.codec.autoencoder.Autoencoder.decode": lambda: (codec().decode, [draw(3, 3)]),
+    "vlgs.codec.identity.Identity.encode": lambda: (Identity(3).encode, [draw(4, 3)]),
+    "vlgs.codec.identity.Identity.decode": lambda: (Identity(3).decode, [draw(4, 3)]),
+    "vlgs.query.similarity.cosines": lambda: (cosines, [draw(4, 3), draw(2, 3, seed=1)]),
+    "vlgs.query.similarity.decoded_cosines": lambda: (
+        lambda c, t: decoded_cosines(Identity(3).decode, c, t, chunk=4), [draw(3, 2, 3), draw(2, 3, seed=1)]
+    ),
+    "vlgs.query.relevancy.LerfRelevancy.relevancy": lambda: (
+        LerfRelevancy().relevancy, [draw(2, 4), draw(3, 4, seed=1)]
+    ),
+    "vlgs.query.relevancy.LerfRelevancy.__call__": lambda: (
+        LerfRelevancy(), [draw(4, 3), draw(2, 3, seed=1), draw(2, 3, seed=2)]
+    ),
+    "vlgs.query.relevancy.VocabSoftmax.relevancy": lambda: (
+        VocabSoftmax().relevancy, [draw(2, 4), draw(3, 4, seed=1)]
+    ),
+    "vlgs.query.relevancy.VocabSoftmax.__call__": lambda: (
+        VocabSoftmax(), [draw(4, 3), draw(2, 3, seed=1), draw(2, 3, seed=2)]
+    ),
+    "vlgs.indicator.Learned.__call__": lambda: (
+        lambda *v: Learned()(activated(*v)), list(parameters().values())
+    ),
+    "vlgs.indicator.ColourOpacity.__call__": lambda: (
+        lambda *v: ColourOpacity()(activated(*v)), list(parameters().values())
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_gradient_matches_finite_differences(name: str):
+    function, inputs = CHECKS[name]()
+    torch.manual_seed(0)
+    leaves = [t.clone().requires_grad_() for t in inputs]
+    assert gradcheck(function, leaves)  # pyright: ignore
+
+
+def test_every_differentiable_function_is_in_a_list():
+    found = {name for area in AREAS for name in public_functions(f"vlgs.{area}")}
+    assert len(found) > 40
+    listed = {name.split()[0] for name in CHECKS} | NO_GRADIENT.keys()
+    assert not found - listed, "new: add it to CHECKS, or to NO_GRADIENT with the reason"
+    assert not listed - found, "gone: take it out"
+
+
+def public_functions(package: str) -> set[str]:
+    """Public functions and methods whose result holds floating tensors, by full name."""
+    root = importlib.import_module(package)
+    paths = getattr(root, "__path__", [])
+    modules = [root.__name__, *(m.name for m in pkgutil.walk_packages(paths, package + "."))]
+    found = set()
+    for module in modules:
+        for name, value in vars(importlib.import_module(module)).items():
+            if name.startswith("_") or getattr(value, "__module__", None) != module:
+                continue
+            members = vars(value).items() if inspect.isclass(value) else [("", value)]
+            for member, function in members:
+                if member.startswith("_") and member != "__call__":
+                    continue
+                returns = str(getattr(function, "__annotations__", {}).get("return", ""))
+                if inspect.isfunction(function) and any(
+                    kind in returns
+                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "Splats")
+                ):
+                    found.add(f"{module}.{name}.{member}".rstrip("."))
+    return found
+
+
+def test_the_config_of_these_checks_has_no_cutoff_in_the_way():
+    assert SMOOTH.alpha_min < 1e-9 < RasterConfig().alpha_min
+    assert SMOOTH.transmittance_min == 0

@@ -1,0 +1,100 @@
+"""Bit-identity: one build, CPU and instruction set give one result for any number of threads and any repeat (N12)."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from vlgs import _csrc
+from vlgs.bench.stress.case import Case, Verdict
+from vlgs.bench.stress.splats import make_splats, render_with_gradients, tensors_of
+from vlgs.bench.stress.training import make_module, train
+
+THREADS = (1, 2, 3)
+
+
+def digest(tensors: list[Tensor]) -> str:
+    """A hash of every bit."""
+    hasher = hashlib.blake2b(digest_size=8)
+    for tensor in tensors:
+        hasher.update(tensor.detach().contiguous().numpy().tobytes())
+    return hasher.hexdigest()
+
+
+def measure(full: bool) -> dict[str, str | list[str]]:
+    """Digests of image and gradients, and of a short training, over threads and repeats, on the instruction set of this process."""
+    n, size = (200_000, (640, 480)) if full else (6000, (185, 145))
+    # Faint, so that no Gaussian is hidden and every slot of every tile has something to add.
+    scenes = []
+    for channels in ((3, 3), (3, 16)):
+        splats = make_splats(n, seed=1, size=size, channels=channels)
+        scenes.append(
+            replace(
+                splats, scales=0.3 * splats.scales, weights=tuple(0.05 * w for w in splats.weights)
+            )
+        )
+    before = torch.get_num_threads()
+    pictures, trainings = [], []
+    try:
+        for threads in THREADS:
+            torch.set_num_threads(threads)
+            for _ in range(5 if full else 2):
+                results = [tensors_of(*render_with_gradients(scene)) for scene in scenes]
+                pictures.append(digest([t for result in results for t in result]))
+            for _ in range(5 if full else 1):
+                trainings.append(_train(200 if full else 24))
+    finally:
+        torch.set_num_threads(before)
+    return {"isa": _csrc.isa(), "pictures": pictures, "trainings": trainings}
+
+
+def _train(iterations: int) -> str:
+    module = make_module(
+        f"trainer.iterations={iterations}", f"trainer.sh_every={iterations // 4}",
+        f"gaussians.densify={{start: 2, stop: {iterations}, every: {iterations // 6}, reset_every: {iterations // 2}, grad_threshold: 1e-6}}",
+        "trainer.checkpoint_every=0",
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        train(module, Path(folder))
+    moments = [t for state in module.optimizer.state.values() for t in state.values()]
+    return digest([*module.model.state_dict().values(), *moments])
+
+
+def threads_and_repeats(full: bool) -> Verdict:
+    """1, 2 and 3 threads, five repeats each, on every instruction set the machine has: image, gradients and 200 training steps have the same bits."""
+    sets = ("base", "v3", "v4") if full else (_csrc.isa(),)
+    done: dict[str, dict[str, list[str]]] = {}
+    for isa in sets:
+        result = measure(full) if len(sets) == 1 else _in_process(isa)
+        done[str(result.pop("isa"))] = result
+    passed = all(len(set(runs)) == 1 for result in done.values() for runs in result.values())
+    parts = [
+        f"{isa}: "
+        + ", ".join(f"{len(set(runs))} of {len(runs)} {what}" for what, runs in result.items())
+        for isa, result in done.items()
+    ]
+    return Verdict("different results, " + "; ".join(parts), passed)
+
+
+def _in_process(isa: str) -> dict:
+    """The instruction set is chosen when the kernel is first used, so each needs a process."""
+    script = (
+        "import json; from vlgs.bench.stress.bits import measure; print(json.dumps(measure(True)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | {"VLGS_ISA": isa},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise RuntimeError(f"stress: {isa} must run to its end, got {done.stderr[-500:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+BITS = (Case("N12 threads and repeats", threads_and_repeats),)
