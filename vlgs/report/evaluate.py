@@ -114,8 +114,9 @@ def _conclude(
             "no held-out pixel is valid" if scene.test else "there are no held-out views"
         )
     trained = {view.name for view in scene.train}
+    labels = [f"labels={scene.label_set}"] if scene.label_set else []
     return Evaluation(
-        protocol=f"{tag} split={scene.split}",
+        protocol=" ".join([tag, *labels, f"split={scene.split}"]),
         psnr=psnr,
         ssim=ssim,
         miou=language.miou,

@@ -38,8 +38,9 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
         metrics: As `vlgs.report.results.write_metrics` returns them.
         paths: What it is -> where it is, in the order to print.
     """
+    seen, views = metrics.get("test_views_seen") or 0, metrics.get("test_views")
     table = Table("metric", box=box.SIMPLE_HEAD)
-    table.add_column("held-out views", justify="right")
+    table.add_column("evaluated views" if seen else "held-out views", justify="right")
     for name, label, form in _ROWS:
         value = metrics.get(name)
         if value is not None:
@@ -50,6 +51,9 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     for category, iou in per_category.items():
         table.add_row(Text(f"  {category}"), "--" if iou is None else f"{iou:.1%}", style="dim")
     notes = [Text(f"{name}: {why}", style="yellow") for name, why in metrics["reasons"].items()]
+    if seen:
+        told = f"{seen} of {views} evaluated views were trained on: these are not held-out scores"
+        notes.append(Text(told, style="yellow"))
     width = max((len(label) for label in paths), default=0)
     places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
     return Group(table, *notes, Text(f"protocol: {metrics['protocol']}"), *places)
