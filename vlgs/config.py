@@ -103,6 +103,9 @@ def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
+    if isinstance(kept.get("gaussians"), dict):
+        # The content of the file that it names is part of the fingerprint.
+        kept["gaussians"] = {k: v for k, v in kept["gaussians"].items() if k != "init"}
     identity = {"config": kept, "data": fingerprint, "results_version": results_version}
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()

@@ -45,13 +45,15 @@ def run(config: DictConfig) -> int:
     check_config(config)
     import torch
 
+    from vlgs.interchange import file_digest
     from vlgs.module.state import RESULTS_VERSION
 
     torch.set_num_threads(config.threads)
     scene = instantiate(config.data)
-    folder = RunFolder(
-        Path(config.results) / "runs" / run_id(config, scene.fingerprint, RESULTS_VERSION)
-    )
+    content = scene.fingerprint
+    if config.gaussians.init is not None:
+        content += f" {file_digest(config.gaussians.init)}"
+    folder = RunFolder(Path(config.results) / "runs" / run_id(config, content, RESULTS_VERSION))
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"

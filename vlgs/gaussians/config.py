@@ -76,6 +76,8 @@ class GaussiansConfig:
     prune_on: Literal["max", "opacity"] = "max"
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
     reading of the paper (systems.md D.10)."""
+    init: str | None = None
+    """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (systems.md D.11)."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)

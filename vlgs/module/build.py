@@ -9,6 +9,7 @@ from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, initialise
 from vlgs.indicator import Indicator
+from vlgs.interchange import start_from
 from vlgs.losses import Losses
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import TrainerConfig
@@ -48,6 +49,9 @@ def build_module(scene: Scene, parts: Parts, seed: int) -> VLGSModule:
         # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
-    parameters = initialise(scene, config, codec.dim, seed)
+    if config.init is None:
+        parameters = initialise(scene, config, codec.dim, seed)
+    else:
+        parameters = start_from(config.init, config, codec.dim)
     model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, sh_degree=0)
     return VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed)

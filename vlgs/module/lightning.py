@@ -181,7 +181,9 @@ class VLGSModule(L.LightningModule):
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.extent
         highest = {0: 0, 3: 1, 8: 2, 15: 3}[self.model.splats["shN"].shape[1]]
-        self.model.sh_degree = min(highest, step // self.settings.sh_every)
+        # Gaussians that come trained have all their degrees from the start.
+        trained = self.gaussians_config.init is not None
+        self.model.sh_degree = highest if trained else min(highest, step // self.settings.sh_every)
 
     def _render(self, target: Target, fused: FusedGaussians) -> ViewRender:
         language = target.codes is not None
