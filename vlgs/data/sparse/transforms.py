@@ -7,6 +7,7 @@ instant-ngp records no such thing: its world stays as it is. Points come from ``
 
 import io
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -175,16 +176,16 @@ def _lens(
     if keys.get("w") is None or keys.get("h") is None:
         width, height = _image_size(path, where, image)
     else:
-        width, height = int(number("w", least=1)), int(number("h", least=1))
+        width, height = int(number("w", least=1.0)), int(number("h", least=1.0))
     if keys.get("fl_x") is None and keys.get("camera_angle_x") is not None:
-        focal = width / 2 / np.tan(number("camera_angle_x", least=1e-3) / 2)
+        focal = width / 2 / math.tan(number("camera_angle_x", least=1e-3) / 2)
     else:
         focal = number("fl_x", least=1e-3)
     if keys.get("fl_y") is None and keys.get("camera_angle_y") is not None:
-        other = height / 2 / np.tan(number("camera_angle_y", least=1e-3) / 2)
+        other = height / 2 / math.tan(number("camera_angle_y", least=1e-3) / 2)
     else:
         other = number("fl_y", focal, least=1e-3)
-    pinhole = (float(focal), float(other), number("cx", width / 2), number("cy", height / 2))
+    pinhole = (focal, other, number("cx", width / 2), number("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in _DISTORTION)
     model = keys.get("camera_model", "OPENCV_FISHEYE" if keys.get("is_fisheye") else "OPENCV")
     if model == "OPENCV_FISHEYE":
