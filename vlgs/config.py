@@ -33,6 +33,9 @@ NOT_PART_OF_A_RUN = frozenset(
 """Keys that cannot move a number. `data` is replaced by the fingerprint of the scene it leads to, so that a run does
 not depend on the folder that its data lies in."""
 
+GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
+"""Keys that name a file to start from: what is in it counts for a run's id, not where it lies."""
+
 
 def check_config(config: DictConfig) -> None:
     """Refuse a configuration of `vlgs.run` that cannot work, before anything is read.
@@ -103,9 +106,9 @@ def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
-    if isinstance(kept.get("gaussians"), dict):
-        # The content of the file that it names is part of the fingerprint.
-        kept["gaussians"] = {k: v for k, v in kept["gaussians"].items() if k != "init"}
+    for group, key in GIVEN_FILES:
+        if isinstance(kept.get(group), dict):
+            kept[group] = {k: v for k, v in kept[group].items() if k != key}
     identity = {"config": kept, "data": fingerprint, "results_version": results_version}
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import CONF, check_config, instantiate, run_id
+from vlgs.config import CONF, GIVEN_FILES, check_config, instantiate, run_id
 from vlgs.runs import RunFolder
 
 log = logging.getLogger(__name__)
@@ -50,9 +50,8 @@ def run(config: DictConfig) -> int:
 
     torch.set_num_threads(config.threads)
     scene = instantiate(config.data)
-    content = scene.fingerprint
-    if config.gaussians.init is not None:
-        content += f" {file_digest(config.gaussians.init)}"
+    given = {key: config[group].get(key) for group, key in GIVEN_FILES}
+    content = " ".join([scene.fingerprint, *(file_digest(p, k) for k, p in given.items() if p)])
     folder = RunFolder(Path(config.results) / "runs" / run_id(config, content, RESULTS_VERSION))
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(

@@ -11,7 +11,12 @@ from torch.nn.functional import normalize
 from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert
 from vlgs.data.language import find_mask_files, read_mask_ids, read_mask_vectors, write_mask_files
-from vlgs.interchange import compress_language, read_autoencoder, write_autoencoder
+from vlgs.interchange import (
+    compress_language,
+    load_weights,
+    read_autoencoder,
+    write_autoencoder,
+)
 
 
 class LangSplats(nn.Module):
@@ -98,6 +103,19 @@ def test_other_widths_and_our_own_file_come_back(tmp_path: Path):
     before, after = (torch.load(tmp_path / n, weights_only=True) for n in ("a.pth", "b.pth"))
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_a_codec_takes_weights_in_place_of_a_fit(tmp_path: Path):
+    net = trained()
+    torch.save(net.state_dict(), tmp_path / "best_ckpt.pth")
+    codec = Autoencoder(weights=str(tmp_path / "best_ckpt.pth"))
+    load_weights(codec, tmp_path / "best_ckpt.pth")
+    with torch.no_grad():
+        assert torch.equal(codec.encode(embeddings()), net.encode(embeddings()))
+    with pytest.raises(
+        ValueError, match=r"widths must be \(\(8,\), 3, \(8,\)\) as configured, got"
+    ):
+        load_weights(Autoencoder(3, (8,), (8,)), tmp_path / "best_ckpt.pth")
 
 
 def test_weights_that_do_not_fit_are_named(tmp_path: Path):

@@ -7,11 +7,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 
+from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert, main
 from vlgs.gaussians import PARAMETERS, read_ply, write_ply
+from vlgs.interchange import write_autoencoder
 from vlgs.run import run
+from vlgs.types import Scene
 
 
 def some_gaussians(n: int = 40, width: int = 3) -> dict[str, torch.Tensor]:
@@ -30,7 +34,9 @@ def test_the_command_says_what_it_did_and_what_is_lost(
     write_ply(tmp_path / "a.ply", some_gaussians())
     main([str(tmp_path / "a.ply"), str(tmp_path / "b.splat")])
     out = capsys.readouterr().out.splitlines()
-    assert out[0].endswith("b.splat: 40 Gaussians as 32 bytes a Gaussian; no view dependence, no language")
+    assert out[0].endswith(
+        "b.splat: 40 Gaussians as 32 bytes a Gaussian; no view dependence, no language"
+    )
     assert out[1:] == [
         "not kept: spherical harmonics above degree 0",
         "not kept: language features",
@@ -88,7 +94,13 @@ def test_as_a_program(tmp_path: Path):
 def test_a_run_starts_from_a_file_and_its_content_is_part_of_the_id(tmp_path: Path):
     write_ply(tmp_path / "a.ply", some_gaussians(200))
     convert(tmp_path / "a.ply", tmp_path / "copy.ply")
-    options = [*TINY, f"results={tmp_path}", "trainer=smoke", "trainer.iterations=2", "pictures=false"]
+    options = [
+        *TINY,
+        f"results={tmp_path}",
+        "trainer=smoke",
+        "trainer.iterations=2",
+        "pictures=false",
+    ]
 
     def go(name: str) -> set[str]:
         assert run(composed(*options, f"gaussians.init={tmp_path / name}")) == 0
@@ -102,3 +114,24 @@ def test_a_run_starts_from_a_file_and_its_content_is_part_of_the_id(tmp_path: Pa
     assert (moved - some_gaussians(200)["means"]).abs().max() < 0.1
     write_ply(tmp_path / "copy.ply", some_gaussians(100))
     assert len(go("copy.ply")) == 2
+
+
+def test_a_run_takes_the_weights_of_an_autoencoder(tmp_path: Path, tiny_scene: Scene):
+    codec = Autoencoder(training=AutoencoderTraining(steps=20))
+    codec.fit(tiny_scene.mask_vectors, tiny_scene.mask_areas)
+    write_autoencoder(tmp_path / "best_ckpt.pth", codec)
+    weights = f"codec.weights={tmp_path / 'best_ckpt.pth'}"
+    options = [
+        *TINY,
+        f"results={tmp_path}",
+        "trainer=smoke",
+        "trainer.iterations=1",
+        "pictures=false",
+    ]
+    assert run(composed(*options, weights)) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    (saved,) = (folder / "checkpoint").glob("*.safetensors")
+    kept = load_file(saved)["model.codec.encoder.0.weight"]
+    assert torch.equal(kept, codec.encoder[0].weight)
+    with pytest.raises(FileNotFoundError, match="weights must be a file"):
+        run(composed(*options, "codec.weights=nowhere.pth"))

@@ -1,8 +1,8 @@
 """A photographed scene: COLMAP's cameras and points, with labels and language maps where there are any.
 
     <root>/images/<name>.jpg                  or images_2, images_4, ...: scaled copies
-    <root>/sparse/0/{cameras,images,points3D}.bin (or .txt; or right under sparse/)
-    <root>/labels/                            optional: LERF-OVS JSON, or dense PNG and classes.json
+    <root>/sparse/0/{cameras,images,points3D}.bin (or .txt; or right under sparse/; or transforms.json, poses_bounds.npy)
+    <root>/labels/                            optional: see `vlgs.data.labels.open_labels`
     <root>/language_features/<stem>_{s,f}.npy optional: LangSplat's layout, and vocabulary.npz
 
 Labels and language maps are matched to images by file stem and lie in the geometry of the image file: what the loader does
@@ -175,7 +175,10 @@ def _require_tree(source: ColmapSource) -> tuple[Path, str]:
 def _tree(source: ColmapSource) -> list[tuple[Path, bool | None, str]]:
     """Every folder of a scene, whether it is there (None: it need not be) and what it holds."""
     folder = source.folder
-    sparse = "cameras.bin images.bin points3D.bin (or .txt; or right under sparse/)"
+    sparse = (
+        "cameras.bin images.bin points3D.bin (or .txt; or right under sparse/; or else transforms.json or "
+        "poses_bounds.npy in the scene's folder)"
+    )
     tree: list[tuple[Path, bool | None, str]] = [
         (Path(source.root), Path(source.root).is_dir(), ""),
         (folder, folder.is_dir(), ""),

@@ -3,7 +3,7 @@
 Nothing here runs code from a file: pickles are read by torch's own restricted reader, which knows tensors and plain values.
 """
 
-from vlgs.interchange.autoencoder import read_autoencoder, write_autoencoder
+from vlgs.interchange.autoencoder import load_weights, read_autoencoder, write_autoencoder
 from vlgs.interchange.gaussians import FORMATS, Imported, read_gaussians, write_gaussians
 from vlgs.interchange.language import compress_language
 from vlgs.interchange.start import file_digest, start_from
@@ -13,6 +13,7 @@ __all__ = [
     "Imported",
     "compress_language",
     "file_digest",
+    "load_weights",
     "read_autoencoder",
     "read_gaussians",
     "start_from",

@@ -46,6 +46,22 @@ def read_autoencoder(path: str | Path) -> Autoencoder:
     return codec
 
 
+def load_weights(codec: Autoencoder, path: str | Path) -> None:
+    """Give a codec the weights of a file, in place of a fit.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no autoencoder, or one of other widths.
+    """
+    read = read_autoencoder(path)
+    own = (codec.encoder_widths, codec.dim, codec.decoder_widths)
+    widths = (read.encoder_widths, read.dim, read.decoder_widths)
+    if own != widths:
+        raise ValueError(f"autoencoder {path}: widths must be {own} as configured, got {widths}")
+    codec.load_state_dict(read.state_dict())
+    codec.requires_grad_(False)
+
+
 def _load(path: Path) -> Any:
     if path.suffix != ".safetensors":
         return load_plain(path)

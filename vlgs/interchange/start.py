@@ -51,13 +51,13 @@ def start_from(path: str | Path, config: GaussiansConfig, feature_dim: int) -> d
     return params
 
 
-def file_digest(path: str | Path) -> str:
-    """Hash of a file's content: it moves every number of the run that starts from it.
+def file_digest(path: str | Path, key: str = "init") -> str:
+    """Hash of a file's content: it moves every number of the run that starts from it. `key` names it in the error.
 
     Raises:
         FileNotFoundError: If there is no such file.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"gaussians: init must be a file, got {path}")
+        raise FileNotFoundError(f"run: {key} must be a file, got {path}")
     with Path(path).open("rb") as stream:
         return hashlib.file_digest(stream, "blake2b").hexdigest()[:32]
