@@ -1,6 +1,7 @@
 """Miniature releases: the procedural scene in the folder layout of each data set, file names included."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,15 @@ def truth() -> Scene:
     return load_scene(**SIZE)
 
 
+def as_taken(scene: Scene) -> Scene:
+    """The same views under the names that a camera gives, which is how Mip-NeRF 360 has them; the order stays."""
+    names = sorted(view.name for view in (*scene.train, *scene.test))
+    new = {name: f"DSC{7950 + 3 * i:05d}" for i, name in enumerate(names)}
+    train = tuple(replace(view, name=new[view.name]) for view in scene.train)
+    test = tuple(replace(view, name=new[view.name]) for view in scene.test)
+    return replace(scene, train=train, test=test)
+
+
 def class_masks(view: View, scene: Scene) -> dict[str, np.ndarray]:
     """Class -> mask, of the classes that the view shows."""
     assert view.read_dense_labels is not None
@@ -32,7 +42,8 @@ def objects(view: View) -> ObjectLabels:
 
 
 def _write_colmap(scene: Scene, folder: Path) -> None:
-    language = dict(language_levels(Recipe(**SIZE)))
+    levels = language_levels(Recipe(**SIZE))
+    language = dict(zip((view.name for view in scene.train), levels.values(), strict=True))
     some = next(iter(language.values()))
     # A release has language maps of every image; those of the held-out ones are never compared.
     write_scene(scene, folder, language | {view.name: some for view in scene.test})
@@ -65,7 +76,7 @@ def write_ovs3d(scene: Scene, root: Path, name: str = "bed") -> None:
 
 
 def write_mipnerf360(scene: Scene, root: Path, name: str = "garden") -> None:
-    _write_colmap(scene, root / name)
+    _write_colmap(as_taken(scene), root / name)
     shutil.rmtree(root / name / "label")
     images = root / name / "images"
     images.rename(root / name / "images_4")
@@ -73,7 +84,7 @@ def write_mipnerf360(scene: Scene, root: Path, name: str = "garden") -> None:
 
 
 def write_goi(scene: Scene, root: Path, name: str = "garden") -> None:
-    for view in scene.test:
+    for view in as_taken(scene).test:
         for category, mask in class_masks(view, scene).items():
             folder = root / name / category / "masks"
             folder.mkdir(parents=True, exist_ok=True)
