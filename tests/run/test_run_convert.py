@@ -132,6 +132,6 @@ def test_a_run_takes_the_weights_of_an_autoencoder(tmp_path: Path, tiny_scene: S
     (folder,) = (tmp_path / "runs").iterdir()
     (saved,) = (folder / "checkpoint").glob("*.safetensors")
     kept = load_file(saved)["model.codec.encoder.0.weight"]
-    assert torch.equal(kept, codec.encoder[0].weight)
+    assert torch.equal(kept, codec.state_dict()["encoder.0.weight"])
     with pytest.raises(FileNotFoundError, match="weights must be a file"):
         run(composed(*options, "codec.weights=nowhere.pth"))
