@@ -33,6 +33,9 @@ NOT_PART_OF_A_RUN = frozenset(
 """Keys that cannot move a number. `data` is replaced by the fingerprint of the scene it leads to, so that a run does
 not depend on the folder that its data lies in."""
 
+GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
+"""Keys that name a file to start from: what is in it counts for a run's id, not where it lies."""
+
 
 def check_config(config: DictConfig) -> None:
     """Refuse a configuration of `vlgs.run` that cannot work, before anything is read.
@@ -103,19 +106,12 @@ def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
-    if isinstance(kept.get("gaussians"), dict):
-        kept["gaussians"] = _by_content(kept["gaussians"], "init")
+    for group, key in GIVEN_FILES:
+        if isinstance(kept.get(group), dict):
+            kept[group] = {k: v for k, v in kept[group].items() if k != key}
     identity = {"config": kept, "data": fingerprint, "results_version": results_version}
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-
-
-def _by_content(group: dict[Any, Any], key: str) -> dict[Any, Any]:
-    """A group with the file that a key names replaced by what is in it; one that is missing is an error later."""
-    path = group.get(key)
-    if path is None or not Path(path).is_file():
-        return group
-    return group | {key: hashlib.blake2b(Path(path).read_bytes(), digest_size=8).hexdigest()}
 
 
 def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:

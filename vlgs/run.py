@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import CONF, check_config, instantiate, run_id
+from vlgs.config import CONF, GIVEN_FILES, check_config, instantiate, run_id
 from vlgs.runs import RunFolder
 
 log = logging.getLogger(__name__)
@@ -48,13 +48,14 @@ def run(config: DictConfig) -> int:
     check_config(config)
     import torch
 
+    from vlgs.interchange import file_digest
     from vlgs.module.state import RESULTS_VERSION
 
     torch.set_num_threads(config.threads)
     scene = instantiate(config.data)
-    folder = RunFolder(
-        Path(config.results) / "runs" / run_id(config, scene.fingerprint, RESULTS_VERSION)
-    )
+    given = {key: config[group].get(key) for group, key in GIVEN_FILES}
+    content = " ".join([scene.fingerprint, *(file_digest(p, k) for k, p in given.items() if p)])
+    folder = RunFolder(Path(config.results) / "runs" / run_id(config, content, RESULTS_VERSION))
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"

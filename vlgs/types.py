@@ -99,6 +99,8 @@ class Scene:
     class_kinds: Mapping[str, str] = field(default_factory=dict)
     """Category -> ``translucent_reflective`` or ``other``, where it is known."""
     vocabulary: Vocabulary | None = None
+    label_set: str = ""
+    """Which labels of a data set these are, where there are several (``mipnerf360_goi``); part of the protocol's name."""
     fingerprint: str = ""
     """Content hash of all that was read; two scenes with one fingerprint give one result."""
 

@@ -27,9 +27,21 @@ OPTIONS = sorted(
 )
 
 
+NEEDED = {
+    "colmap": ["data.root=somewhere"],
+    "nerfstudio": ["data.root=somewhere"],
+    "lerf_ovs": ["data.root=somewhere", "data.scene=ramen"],
+    "ovs3d": ["data.root=somewhere", "data.scene=bed"],
+    "mipnerf360": ["data.root=somewhere", "data.scene=garden"],
+    "mipnerf360_goi": ["data.root=a", "data.scene=room", "data.release.labels=b"],
+    "mipnerf360_gags": ["data.root=a", "data.scene=room", "data.release.labels=b"],
+}
+"""What an option cannot do without."""
+
+
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_option_composes_and_constructs(group: str, option: str):
-    overrides = [f"{group}={option}"] + (["data.root=somewhere"] if option == "colmap" else [])
+    overrides = [f"{group}={option}", *(NEEDED.get(option, ()) if group == "data" else ())]
     config = composed(*overrides)
     check_targets(config)
     OmegaConf.resolve(config)

@@ -156,3 +156,17 @@ def test_machine_is_described(tmp_path: Path):
     cpuinfo.write_text("processor\t: 0\nmodel name\t: Fast CPU @ 2.7GHz\nmodel name\t: other\n")
     assert _cpu_model(cpuinfo) == "Fast CPU @ 2.7GHz"
     assert _cpu_model(tmp_path / "absent")
+
+
+def test_the_summary_says_that_evaluated_views_were_trained_on():
+    def printed(seen: int) -> str:
+        stream = io.StringIO()
+        console = Console(file=stream, width=120)
+        metrics = {"protocol": "p", "reasons": {}, "test_views": 4, "test_views_seen": seen}
+        print_summary(metrics, {}, console)
+        return stream.getvalue()
+
+    assert "3 of 4 evaluated views were trained on: these are not held-out scores" in printed(3)
+    assert "evaluated views " in printed(3)
+    assert "trained on" not in printed(0)
+    assert "held-out views" in printed(0)

@@ -87,6 +87,8 @@ class Autoencoder(nn.Module):
             LangSplat's.
         training: Schedule and weights of the fit.
         cache_dir: Folder of fitted weights by content of data and settings; None keeps nothing.
+        weights: File of weights that take the place of a fit (`vlgs.interchange.load_weights` reads it), such as those that
+            LangSplat's codes were made with.
 
     Raises:
         ValueError: If a width is not positive or there is no hidden layer.
@@ -103,6 +105,7 @@ class Autoencoder(nn.Module):
         center: bool = True,
         training: AutoencoderTraining = DEFAULT_TRAINING,
         cache_dir: str | Path | None = None,
+        weights: str | None = None,
     ) -> None:
         super().__init__()
         widths = (dim, *encoder_widths, *decoder_widths)
@@ -116,6 +119,7 @@ class Autoencoder(nn.Module):
         self.decoder_widths = tuple(decoder_widths)
         self.center = center
         self.fit_settings = training
+        self.weights = weights
         self.cache_dir = None if cache_dir is None else Path(cache_dir)
         self.encoder, self.decoder = nn.Sequential(), nn.Sequential()
         self.register_buffer("mean", torch.zeros(0))

@@ -1,8 +1,8 @@
 """A photographed scene: COLMAP's cameras and points, with labels and language maps where there are any.
 
     <root>/images/<name>.jpg                  or images_2, images_4, ...: scaled copies
-    <root>/sparse/0/{cameras,images,points3D}.bin (or .txt; or right under sparse/)
-    <root>/labels/                            optional: LERF-OVS JSON, or dense PNG and classes.json
+    <root>/sparse/0/{cameras,images,points3D}.bin (or .txt; or right under sparse/; or transforms.json, poses_bounds.npy)
+    <root>/labels/                            optional: see `vlgs.data.labels.open_labels`
     <root>/language_features/<stem>_{s,f}.npy optional: LangSplat's layout, and vocabulary.npz
 
 Labels and language maps are matched to images by file stem and lie in the geometry of the image file: what the loader does
@@ -11,14 +11,14 @@ to a photograph (undistort, resize) it does to them.
 
 import hashlib
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from vlgs.data.cache import PixelCache
-from vlgs.data.faults import Fault, FaultList, SceneError, errors, require_sound
+from vlgs.data.faults import Fault, FaultList, SceneError, errors, listing, require_sound
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
 from vlgs.data.language import read_vocabulary
 from vlgs.data.masks import MaskTable, gather_masks, missing_faults
@@ -37,7 +37,9 @@ class ColmapSource:
     """What to read, and how. The keys of ``conf/data/colmap.yaml``."""
 
     root: str
-    """Folder of the scene."""
+    """Folder of the scene; with `scene`, of a release with several."""
+    scene: str | None = None
+    """Folder below `root`."""
     images: str = "images"
     """Image folder below it."""
     resize: float = 1.0
@@ -50,6 +52,10 @@ class ColmapSource:
     """One view of so many is held out, with split=llff."""
     labels: str | None = None
     """Label folder; by default ``<root>/labels`` if there is one."""
+    label_names: str = "stem"
+    """How labels name their images: ``stem``, or ``position``: see `vlgs.data.labels.ObjectFolder.by_position`."""
+    label_set: str = ""
+    """Goes into the name of the protocol; see `vlgs.types.Scene.label_set`."""
     features: str | None = None
     """Folder of language maps; by default ``<root>/language_features`` if there is one."""
     vocabulary: str | None = None
@@ -58,8 +64,10 @@ class ColmapSource:
     """Mask level: 0 default, 1 subpart, 2 part, 3 whole."""
     allow_missing_masks: bool = False
     """Whether a training view may lack language maps where others have them."""
-    cache_bytes: int = 1 << 30
+    cache_bytes: int = 1 << 28
     """Decoded pixels that are kept in memory."""
+    release: Mapping[str, Any] = field(default_factory=dict)
+    """What the paths of a data set's configuration are put together from; `name` says what is looked for."""
 
     def __post_init__(self) -> None:
         if not 0 < self.resize <= 1:
@@ -68,7 +76,15 @@ class ColmapSource:
             raise ValueError(f"data: level must be 0, 1, 2 or 3, got {self.level}")
         if self.cache_bytes < 0:
             raise ValueError(f"data: cache_bytes must not be negative, got {self.cache_bytes}")
+        if self.label_names not in ("stem", "position"):
+            expected = "label_names must be stem or position"
+            raise ValueError(f"data: {expected}, got {self.label_names!r}")
         _ = self.rule
+
+    @property
+    def folder(self) -> Path:
+        """Of the scene."""
+        return Path(self.root) / (self.scene or "")
 
     @property
     def rule(self) -> Split:
@@ -133,13 +149,13 @@ def survey(source: ColmapSource) -> Survey:
         return Survey((error.fault,))
     faults = FaultList(model_faults(model))
     images = ImageFolder(
-        Path(source.root) / source.images, source.resize, PixelCache(source.cache_bytes)
+        source.folder / source.images, source.resize, PixelCache(source.cache_bytes)
     )
     views = faults.take(open_views(model, images))
     faults += coverage_warnings(model, views, images)
-    labels = faults.take(_open_labels(source))
+    labels = faults.take(_open_labels(source, views))
     views = faults.take(attach_labels(views, labels, images))
-    faults += source.rule.faults(*_names(views), source.root)
+    faults += source.rule.faults(*_names(views), str(source.folder))
     masks = faults.take(_open_masks(source, views))
     vocabulary = faults.take(_open_vocabulary(source, masks))
     if errors(faults):
@@ -150,19 +166,49 @@ def survey(source: ColmapSource) -> Survey:
 
 def _require_tree(source: ColmapSource) -> tuple[Path, str]:
     """Folder and suffix of the sparse files."""
-    root = Path(source.root)
-    found = find_sparse(root)
-    if found is None or not (root / source.images).is_dir():
-        tree = f"""
-  {root}/
-    {source.images}/<name>.jpg ...
-    sparse/0/cameras.bin images.bin points3D.bin   (or .txt; or right under sparse/)"""
-        absent = f"no {root / source.images}" if found else "no sparse model"
-        absent = absent if root.is_dir() else "no such folder"
-        raise FileNotFoundError(
-            f"data: root must hold a COLMAP scene, got {absent}; looked for{tree}"
-        )
+    found = find_sparse(source.folder)
+    if found is None or not all(there for _, there, _ in _tree(source) if there is not None):
+        raise FileNotFoundError(_missing(source))
     return found
+
+
+def _tree(source: ColmapSource) -> list[tuple[Path, bool | None, str]]:
+    """Every folder of a scene, whether it is there (None: it need not be) and what it holds."""
+    folder = source.folder
+    sparse = (
+        "cameras.bin images.bin points3D.bin (or .txt; or right under sparse/; or else transforms.json or "
+        "poses_bounds.npy in the scene's folder)"
+    )
+    tree: list[tuple[Path, bool | None, str]] = [
+        (Path(source.root), Path(source.root).is_dir(), ""),
+        (folder, folder.is_dir(), ""),
+        (folder / "sparse" / "0", find_sparse(folder) is not None, sparse),
+        (folder / source.images, (folder / source.images).is_dir(), "<name>.jpg ..."),
+        (folder / "language_features", None, "<stem>_s.npy <stem>_f.npy, optional"),
+    ]
+    if source.scene and source.labels:
+        tree.append((Path(source.labels), Path(source.labels).is_dir(), "labels"))
+    return list(dict.fromkeys(tree))
+
+
+def _missing(source: ColmapSource) -> str:
+    """The message that a scene is not there: what it lacks, and its tree with a tick or a cross for each folder."""
+    root, tree = Path(source.root), _tree(source)
+    lacks = next((path for path, there, _ in tree if there is False), None)
+    absent = f"no {lacks}"
+    if not source.folder.is_dir():
+        absent = f"no such folder as {source.folder}"
+    elif lacks == source.folder / "sparse" / "0":
+        absent = f"no sparse model in {source.folder}"
+    if source.scene and root.is_dir() and not source.folder.is_dir():
+        there = listing(sorted(path.name for path in root.iterdir() if path.is_dir()))
+        absent += f" (folders beside it: {there})"
+    what = source.release.get("name", "a COLMAP scene")
+    lines = [
+        f"  {'✓' if (path.is_dir() if there is None else there) else '✗'} {path}/  {note}".rstrip()
+        for path, there, note in tree
+    ]
+    return "\n".join([f"data: root must hold {what}, got {absent}; looked for", *lines])
 
 
 def _named_or_default(named: str | None, default: Path, key: str) -> Path | None:
@@ -175,14 +221,19 @@ def _named_or_default(named: str | None, default: Path, key: str) -> Path | None
 
 
 def _open_labels(
-    source: ColmapSource,
+    source: ColmapSource, views: Sequence[ViewSource]
 ) -> tuple[DenseFolder | ObjectFolder | None, tuple[Fault, ...]]:
-    folder = _named_or_default(source.labels, Path(source.root) / "labels", "labels")
-    return (None, ()) if folder is None else open_labels(folder)
+    folder = _named_or_default(source.labels, source.folder / "labels", "labels")
+    if folder is None:
+        return None, ()
+    labels, faults = open_labels(folder)
+    if source.label_names == "position" and isinstance(labels, ObjectFolder):
+        labels = labels.by_position(_names(views)[0])
+    return labels, faults
 
 
 def _feature_folder(source: ColmapSource) -> Path | None:
-    default = Path(source.root) / "language_features"
+    default = source.folder / "language_features"
     return _named_or_default(source.features, default, "features")
 
 
@@ -202,7 +253,7 @@ def _open_masks(
 def _open_vocabulary(
     source: ColmapSource, masks: MaskTable | None
 ) -> tuple[Vocabulary | None, tuple[Fault, ...]]:
-    folder = _feature_folder(source) or Path(source.root) / "language_features"
+    folder = _feature_folder(source) or source.folder / "language_features"
     path = _named_or_default(source.vocabulary, folder / "vocabulary.npz", "vocabulary")
     if path is None:
         return None, ()
@@ -226,7 +277,7 @@ def _assemble(source: ColmapSource, parts: _Parts) -> Scene:
     empty = torch.zeros(0, 512 if parts.vocabulary is None else parts.vocabulary.vectors.shape[1])
     classes, kinds = _classes(parts.labels, {v.name for v in parts.views})
     return Scene(
-        name=Path(source.root).resolve().name,
+        name=source.folder.resolve().name,
         train=tuple(readable[name] for name in train),
         test=tuple(readable[name] for name in test),
         split=source.rule.name,
@@ -237,6 +288,7 @@ def _assemble(source: ColmapSource, parts: _Parts) -> Scene:
         classes=classes,
         class_kinds=kinds,
         vocabulary=parts.vocabulary,
+        label_set=source.label_set,
         fingerprint=_fingerprint(source, parts),
     )
 
@@ -248,8 +300,10 @@ def _classes(
         return labels.classes, labels.class_kinds
     if labels is None:
         return (), {}
+    if labels.classes is not None:
+        return labels.classes, {}
     images = (image for stem, image in labels.images.items() if stem in views)
-    return tuple(sorted({item.category for image in images for item in image.objects})), {}
+    return tuple(sorted({category for image in images for category in image.categories})), {}
 
 
 def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
@@ -265,14 +319,25 @@ def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
         hasher.update(parts.vocabulary.vectors.numpy().tobytes())
     if isinstance(parts.labels, DenseFolder):
         hasher.update(repr((parts.labels.classes, sorted(parts.labels.position.items()))).encode())
+    elif parts.labels is not None and parts.labels.classes is not None:
+        marked = {stem: sorted(image.categories) for stem, image in parts.labels.images.items()}
+        hasher.update(repr((parts.labels.classes, sorted(marked.items()))).encode())
+    if source.label_set:
+        hasher.update(source.label_set.encode())
     for view in parts.views:
-        files = [view.photograph.path] + ([view.labels.files[view.name]] if view.labels else [])
+        files = [view.photograph.path, *_label_files(view)]
         hasher.update(repr((view.name, view.lens, len(files))).encode())
         hasher.update(view.camera.viewmat.numpy().tobytes())
         for file in files:
             with file.open("rb") as stream:
                 hasher.update(hashlib.file_digest(stream, "blake2b").digest())
     return hasher.hexdigest()
+
+
+def _label_files(view: ViewSource) -> tuple[Path, ...]:
+    if isinstance(view.labels, ObjectFolder):
+        return view.labels.images[view.name].files
+    return () if view.labels is None else (view.labels.files[view.name],)
 
 
 def _names(views: Sequence[ViewSource]) -> tuple[list[str], list[str]]:

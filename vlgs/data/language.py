@@ -4,15 +4,17 @@
 for none; ids run on from level to level. ``<stem>_f.npy`` [M, e] holds one unit vector per id.
 """
 
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32
+from jaxtyping import Float, Float32, Int32, Shaped
 
 from vlgs.data.faults import Fault, SceneError
+from vlgs.files import write_atomically
 from vlgs.types import Vocabulary
 
 LEVELS = 4
@@ -93,6 +95,35 @@ def read_mask_vectors(files: MaskFiles) -> Float32[np.ndarray, "m e"]:
         what = f"rows must be finite and of unit length, got length {norms[wrong[0]]} in row {wrong[0]}"
         raise SceneError(Fault(str(files.vectors), f"{what} and {len(wrong) - 1} others"))
     return vectors / norms[:, None]
+
+
+def read_mask_map(files: MaskFiles) -> Shaped[np.ndarray, "levels h w"]:
+    """All levels as they stand in the file.
+
+    Raises:
+        SceneError: If it is not an array [4, H, W] of numbers.
+    """
+    return np.array(_open_ids(files.ids))
+
+
+def write_mask_files(
+    folder: Path, stem: str, ids: Shaped[np.ndarray, "4 h w"], vectors: Float[np.ndarray, "m e"]
+) -> None:
+    """Write the two files of one view, float32 both, each complete or not at all.
+
+    Args:
+        folder: Where to; it must exist.
+        stem: Of the image.
+        ids: Mask per pixel at the four levels, -1 for none; ids run on from level to level.
+        vectors: A unit vector per id.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    for suffix, array in (("f", vectors), ("s", ids)):
+        stream = io.BytesIO()
+        np.save(stream, array.astype(np.float32))
+        write_atomically(folder / f"{stem}_{suffix}.npy", stream.getvalue())
 
 
 def read_vocabulary(path: Path) -> Vocabulary:

@@ -133,7 +133,9 @@ def attach_labels(
             )
         if isinstance(labels, ObjectFolder) and not is_copy_of(size, view.lens.file_size):
             expected = f"that of the image ({view.lens.file_size}) or a scaled copy's"
-            faults.append(Fault(file, f"info.width and info.height must be {expected}, got {size}"))
+            # A polygon's JSON says its size, a mask has it.
+            own = "size" if labels.classes else "info.width and info.height"
+            faults.append(Fault(file, f"{own} must be {expected}, got {size}"))
     faults += _stray_labels(views, labels.files, folder)
     labelled = (replace(v, labels=labels) if v.name in labels.files else v for v in views)
     return tuple(labelled), tuple(faults)

@@ -76,11 +76,11 @@ class GaussiansConfig:
     prune_on: Literal["max", "opacity"] = "max"
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
     reading of the paper (systems.md D.10)."""
+    init: str | None = None
+    """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (systems.md D.11)."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
-    init: str | None = None
-    """A point_cloud.ply to start from, of this program or any 3DGS; None: the scene's points."""
 
     def __post_init__(self) -> None:
         if self.sh_degree not in range(4):

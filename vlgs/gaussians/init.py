@@ -11,7 +11,6 @@ from torch import Tensor
 from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.neighbors import mean_squared_distance
 from vlgs.gaussians.parameters import logit
-from vlgs.gaussians.ply import read_ply
 from vlgs.gaussians.sh import rgb_to_sh
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
@@ -41,8 +40,6 @@ def initialise(
 ) -> dict[str, Tensor]:
     """Raw parameters of the first Gaussians (3DGS; systems.md A.1), keyed by `PARAMETERS`.
 
-    Those of `GaussiansConfig.init`, if it names a file; language codes of another width are refused, absent ones zero.
-
     Each sparse point becomes an isotropic Gaussian whose variance is the mean squared distance to its three nearest
     neighbours, clamped at 1e-7 below and by `GaussiansConfig.max_init_angle` above. Non-finite points, points on a
     camera and exact duplicates are left out. Without sparse points, random ones fill the volume that most training
@@ -55,15 +52,12 @@ def initialise(
         seed: Decides the random points, and which ones are kept when there are more than `max_count`.
 
     Raises:
-        ValueError: If there is no training view, `feature_dim` is not positive, or the file does not fit.
-        FileNotFoundError: If there is no such file.
+        ValueError: If there is no training view or `feature_dim` is not positive.
     """
     if not scene.train:
         raise ValueError(f"gaussians: scene {scene.name} must have training views, got none")
     if feature_dim < 1:
         raise ValueError(f"gaussians: feature_dim must be at least 1, got {feature_dim}")
-    if config.init is not None:
-        return _from_file(config.init, feature_dim)
     cameras = [view.camera for view in scene.train]
     centers = camera_center(torch.stack([camera.viewmat for camera in cameras])).float()
     generator = seeded_generator("initialise", seed, 0)
@@ -79,18 +73,6 @@ def initialise(
         ].sort()[0]
         cloud = _Cloud(cloud.points[kept], cloud.colors[kept])
     return _parameters(cloud, _initial_scales(cloud.points, centers, config), config, feature_dim)
-
-
-def _from_file(path: str, feature_dim: int) -> dict[str, Tensor]:
-    parameters = read_ply(path, feature_dim)
-    width = parameters["features"].shape[1]
-    if width != feature_dim:
-        raise ValueError(
-            f"gaussians: language codes of {path} must be {feature_dim} wide, got {width}"
-        )
-    if len(parameters["means"]) == 0:
-        raise ValueError(f"gaussians: {path} must hold at least one Gaussian, got none")
-    return parameters
 
 
 def seeded_generator(purpose: str, seed: int, step: int) -> torch.Generator:

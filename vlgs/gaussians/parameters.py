@@ -49,6 +49,18 @@ def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:
     )
 
 
+def complete(params: Mapping[str, Tensor], feature_dim: int) -> dict[str, Tensor]:
+    """All of `PARAMETERS`, in order, of what another system's file holds.
+
+    Args:
+        params: Without `indicator_logits` the opacity's take their place; without `features` they are zero.
+        feature_dim: Width of the language codes where there are none.
+    """
+    n, opacity = len(params["means"]), params["opacity_logits"]
+    absent = {"indicator_logits": opacity.clone(), "features": torch.zeros(n, feature_dim)}
+    return {name: params[name] if name in params else absent[name] for name in PARAMETERS}
+
+
 def logit(probability: float) -> float:
     """Inverse of the logistic function for a value strictly between 0 and 1."""
     return torch.tensor(probability, dtype=torch.float64).logit().item()

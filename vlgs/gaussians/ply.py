@@ -1,8 +1,13 @@
-"""Gaussians as a 3DGS ``point_cloud.ply`` (systems.md C.6), with language codes and indicators appended."""
+"""Gaussians as a 3DGS ``point_cloud.ply`` (systems.md C.6), with language codes and indicators appended.
+
+Three dialects differ in what follows the rotation: ours ``lang_0`` ... and ``indicator``, Feature-3DGS ``semantic_0`` ...,
+3DGS nothing. Whatever is there is read.
+"""
 
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,12 +16,20 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
 from vlgs.files import write_atomically
+from vlgs.gaussians.parameters import complete
+from vlgs.gaussians.sound import require_sound
+
+Dialect = Literal["vlgs", "3dgs", "feature3dgs"]
 
 SH_COEFFICIENTS = (0, 3, 8, 15)
 """Coefficients per colour channel above degree 0, for degrees 0 to 3."""
 
 
-def write_ply(path: str | Path, params: nn.ParameterDict | Mapping[str, Tensor]) -> None:
+def write_ply(
+    path: str | Path,
+    params: nn.ParameterDict | Mapping[str, Tensor],
+    dialect: Dialect = "vlgs",
+) -> None:
     """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
 
     Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator``; readers that look properties up by
@@ -25,13 +38,14 @@ def write_ply(path: str | Path, params: nn.ParameterDict | Mapping[str, Tensor])
     Args:
         path: The file; its folder must exist.
         params: The keys of `vlgs.gaussians.PARAMETERS`.
+        dialect: ``3dgs`` leaves language out, ``feature3dgs`` calls the codes ``semantic_0`` ... and leaves the indicator out.
 
     Raises:
         ValueError: If a value is not finite or a quaternion is zero; names the parameter and how many rows.
         OSError: If the file cannot be written.
     """
     columns = {name: value.detach().to(torch.float32) for name, value in params.items()}
-    _check(f"ply {path}", columns)
+    require_sound(f"ply {path}", columns)
     named: list[tuple[str, Tensor]] = []
     _append(named, ("x", "y", "z"), columns["means"])
     _append(named, ("nx", "ny", "nz"), torch.zeros_like(columns["means"]))
@@ -41,8 +55,11 @@ def write_ply(path: str | Path, params: nn.ParameterDict | Mapping[str, Tensor])
     _append(named, ("opacity",), columns["opacity_logits"][:, None])
     _append(named, _numbered("scale", 3), columns["log_scales"])
     _append(named, _numbered("rot", 4), columns["quats"])
-    _append(named, _numbered("lang", columns["features"].shape[1]), columns["features"])
-    _append(named, ("indicator",), columns["indicator_logits"][:, None])
+    if dialect != "3dgs":
+        stem = "lang" if dialect == "vlgs" else "semantic"
+        _append(named, _numbered(stem, columns["features"].shape[1]), columns["features"])
+    if dialect == "vlgs":
+        _append(named, ("indicator",), columns["indicator_logits"][:, None])
     vertices = np.empty(len(columns["means"]), dtype=[(name, "<f4") for name, _ in named])
     for name, column in named:
         vertices[name] = column.numpy()
@@ -65,13 +82,26 @@ def read_ply(path: str | Path, feature_dim: int = 3) -> dict[str, Tensor]:
         ValueError: If it is not a PLY file, is cut short, lacks a property, or holds a value that is not finite or a
             quaternion that is zero; names the file and what is wrong.
     """
+    params = complete(parse_ply(path), feature_dim)
+    require_sound(f"ply {path}", params)
+    return params
+
+
+def parse_ply(path: str | Path) -> dict[str, Tensor]:
+    """What a file holds of `vlgs.gaussians.PARAMETERS`, not yet judged: `features` and `indicator_logits` may be missing.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not a PLY file, is cut short or lacks a property.
+    """
     path = Path(path)
     vertices = _read_vertices(path)
     present = set(vertices.dtype.names or ())
     n_rest = sum(name.startswith("f_rest_") for name in present)
     if n_rest not in [3 * count for count in SH_COEFFICIENTS]:
         raise ValueError(f"ply {path}: f_rest properties must be 0, 9, 24 or 45, got {n_rest}")
-    n_lang = sum(name.startswith("lang_") for name in present)
+    stem = "lang" if "lang_0" in present else "semantic"
+    n_lang = sum(name.startswith(f"{stem}_") for name in present)
 
     def take(*names: str) -> Float32[Tensor, "n c"]:
         columns = np.empty((len(vertices), len(names)), np.float32)
@@ -85,19 +115,18 @@ def read_ply(path: str | Path, feature_dim: int = 3) -> dict[str, Tensor]:
                 columns[:, index] = vertices[name]
         return torch.from_numpy(columns)
 
-    opacity = take("opacity")[:, 0]
-    codes = take(*_numbered("lang", n_lang)) if n_lang else torch.zeros(len(vertices), feature_dim)
     params = {
         "means": take("x", "y", "z"),
         "quats": take(*_numbered("rot", 4)),
         "log_scales": take(*_numbered("scale", 3)),
         "sh0": take(*_numbered("f_dc", 3)),
         "shN": take(*_numbered("f_rest", n_rest)).unflatten(1, (3, n_rest // 3)).mT.contiguous(),
-        "opacity_logits": opacity,
-        "indicator_logits": take("indicator")[:, 0] if "indicator" in present else opacity.clone(),
-        "features": codes,
+        "opacity_logits": take("opacity")[:, 0],
     }
-    _check(f"ply {path}", params)
+    if "indicator" in present:
+        params["indicator_logits"] = take("indicator")[:, 0]
+    if n_lang:
+        params["features"] = take(*_numbered(stem, n_lang))
     return params
 
 
@@ -117,18 +146,3 @@ def _numbered(stem: str, count: int) -> tuple[str, ...]:
 
 def _append(named: list[tuple[str, Tensor]], names: tuple[str, ...], values: Tensor) -> None:
     named.extend(zip(names, values.unbind(1), strict=True))
-
-
-def _check(who: str, params: Mapping[str, Tensor]) -> None:
-    for name, value in params.items():
-        broken = ~value.isfinite()
-        bad = int((broken if broken.dim() == 1 else broken.flatten(1).any(dim=1)).sum())
-        if bad:
-            raise ValueError(
-                f"{who}: {name} must be finite, got {bad} of {len(value)} rows that are not"
-            )
-    zero = int((params["quats"].norm(dim=1) == 0).sum())
-    if zero:
-        raise ValueError(
-            f"{who}: quats must not be zero, got {zero} of {len(params['quats'])} rows that are"
-        )

@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 
 from vlgs.blend import ViewBlend
 from vlgs.codec import Codec
+from vlgs.codec.autoencoder import Autoencoder
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, initialise
 from vlgs.indicator import Indicator
+from vlgs.interchange import load_weights, start_from
 from vlgs.losses import Losses
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import TrainerConfig
@@ -42,12 +44,18 @@ def build_module(scene: Scene, parts: Parts, seed: int) -> VLGSModule:
         raise ValueError(f"train: training views of {scene.name} must be at least 1, got 0")
     fusion, codec, config = parts.fusion, parts.codec, parts.gaussians
     if scene.mask_vectors.shape[0] > 0:
-        codec.fit(scene.mask_vectors, scene.mask_areas)
+        if isinstance(codec, Autoencoder) and codec.weights is not None:
+            load_weights(codec, codec.weights)
+        else:
+            codec.fit(scene.mask_vectors, scene.mask_areas)
     else:
         log.info("no language supervision: training colour only, without fusion or blended views")
         # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
-    parameters = initialise(scene, config, codec.dim, seed)
+    if config.init is None:
+        parameters = initialise(scene, config, codec.dim, seed)
+    else:
+        parameters = start_from(config.init, config, codec.dim)
     model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, sh_degree=0)
     return VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed)

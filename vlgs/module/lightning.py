@@ -202,10 +202,9 @@ class VLGSModule(L.LightningModule):
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.extent
         highest = {0: 0, 3: 1, 8: 2, 15: 3}[self.model.splats["shN"].shape[1]]
-        if "shN" in self.settings.freeze:  # as they were trained, all at once
-            self.model.sh_degree = highest
-        else:
-            self.model.sh_degree = min(highest, step // self.settings.sh_every)
+        # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
+        trained = self.gaussians_config.init is not None or "shN" in self.settings.freeze
+        self.model.sh_degree = highest if trained else min(highest, step // self.settings.sh_every)
 
     def _fuse(self, targets: tuple[Target, ...], plan: BlendPlan | None) -> FusedGaussians:
         if not self.settings.skip.fuse_visible or isinstance(self.model.fusion, NoFusion):

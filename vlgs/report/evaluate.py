@@ -147,8 +147,9 @@ def _conclude(
     if asked and language.miou is None:
         failure = f"{name}: nothing could be scored, {reasons['miou']}"
     trained = {view.name for view in scene.train}
+    labels = [f"labels={scene.label_set}"] if scene.label_set else []
     return Evaluation(
-        protocol=name,
+        protocol=" ".join([name, *labels]),
         psnr=psnr,
         ssim=ssim,
         miou=language.miou,

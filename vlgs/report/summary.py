@@ -39,8 +39,9 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
         metrics: As `vlgs.report.results.write_metrics` returns them.
         paths: What it is -> where it is, in the order to print.
     """
+    seen, views = metrics.get("test_views_seen") or 0, metrics.get("test_views")
     table = Table("metric", box=box.SIMPLE_HEAD)
-    table.add_column("held-out views", justify="right")
+    table.add_column("evaluated views" if seen else "held-out views", justify="right")
     for name, label, form in _ROWS:
         value = metrics.get(name)
         if value is not None:
@@ -56,6 +57,9 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     notes = [Text(f"{name}: {why}", style="yellow") for name, why in reasons.items()]
     if metrics.get("failure"):
         notes.append(Text(f"failed: {metrics['failure']}", style="bold red"))
+    if seen:
+        told = f"{seen} of {views} evaluated views were trained on: these are not held-out scores"
+        notes.append(Text(told, style="yellow"))
     width = max((len(label) for label in paths), default=0)
     places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
     return Group(table, *notes, Text(f"protocol: {metrics['protocol']}"), *places)

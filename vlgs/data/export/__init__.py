@@ -19,6 +19,7 @@ from PIL import Image
 
 from vlgs.data.export.outline import outlines
 from vlgs.data.export.sparse import write_sparse
+from vlgs.data.language import write_mask_files
 from vlgs.types import Scene, View, Vocabulary
 
 
@@ -130,8 +131,8 @@ def _write_language(
             np.where(level.index >= 0, level.index + start, -1)
             for level, start in zip(levels, starts, strict=True)
         ]
-        np.save(folder / f"{name}_s.npy", np.stack(maps).astype(np.float32))
-        np.save(folder / f"{name}_f.npy", np.concatenate([level.vectors for level in levels]))
+        vectors = np.concatenate([level.vectors for level in levels])
+        write_mask_files(folder, name, np.stack(maps), vectors)
     if vocabulary is not None:
         names, vectors = np.array(vocabulary.names), vocabulary.vectors.numpy()
         np.savez(folder / "vocabulary.npz", names=names, embeddings=vectors)

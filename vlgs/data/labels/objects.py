@@ -5,10 +5,11 @@
 """
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -39,6 +40,16 @@ class LabelledImage:
     height: int
     objects: tuple[LabelledObject, ...]
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Everything that was read."""
+        return (self.path,)
+
+    @property
+    def categories(self) -> frozenset[str]:
+        """What is labelled in the image."""
+        return frozenset(item.category for item in self.objects)
+
     def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
         """Category -> union of its instances, at the JSON's image size."""
         merged: dict[str, np.ndarray] = {}
@@ -55,15 +66,56 @@ class LabelledImage:
         return {category: np.stack(boxes) for category, boxes in rows.items()}
 
 
+@runtime_checkable
+class ObjectImage(Protocol):
+    """Labelled objects of one image: `LabelledImage`, or `vlgs.data.labels.folders.MaskedImage`."""
+
+    @property
+    def width(self) -> int: ...  # noqa: D102
+    @property
+    def height(self) -> int: ...  # noqa: D102
+    @property
+    def files(self) -> tuple[Path, ...]: ...  # noqa: D102
+    @property
+    def categories(self) -> frozenset[str]: ...  # noqa: D102
+    def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]: ...  # noqa: D102
+    def boxes(self) -> dict[str, Float64[np.ndarray, "b 4"]]: ...  # noqa: D102
+
+
 @dataclass(frozen=True)
 class ObjectFolder:
-    """A folder of LERF-OVS labels, read."""
+    """A folder of labelled objects, opened."""
 
     files: Mapping[str, Path]
-    """Stem -> JSON."""
+    """Stem -> JSON, or folder of masks."""
     sizes: Mapping[str, tuple[int, int]]
     """Stem -> width and height that the coordinates refer to."""
-    images: Mapping[str, LabelledImage]
+    images: Mapping[str, ObjectImage]
+    classes: tuple[str, ...] | None = None
+    """What can be asked for, where the folder says so; by default the categories of the images."""
+
+    def by_position(self, names: Sequence[str]) -> "ObjectFolder":
+        """The same labels for the n-th of the images where they are called ``frame_<n>``, n from 1.
+
+        So GAGS and LangSplatV2 number their labels of images that have other names (S. B.4). Labels that have the stem of
+        an image, or no such number, stay as they are.
+
+        Args:
+            names: Stems of all images, in order.
+        """
+        stems = {}
+        for stem in self.files:
+            number = re.fullmatch(r"frame_(\d+)", stem)
+            known = number and stem not in names and 1 <= int(number[1]) <= len(names)
+            stems[stem] = names[int(number[1]) - 1] if number and known else stem
+        if len(set(stems.values())) < len(stems):
+            return self  # numbers and names of one image: what belongs to no image is told as such
+        return replace(
+            self,
+            files={stems[stem]: file for stem, file in self.files.items()},
+            sizes={stems[stem]: size for stem, size in self.sizes.items()},
+            images={stems[stem]: image for stem, image in self.images.items()},
+        )
 
 
 def open_objects(folder: Path) -> tuple[ObjectFolder, tuple[Fault, ...]]:

@@ -84,7 +84,7 @@ class SparseImage:
     """World-to-camera rotation (w, x, y, z)."""
     translation: tuple[float, ...]
     observations: int
-    """Sparse points that it sees."""
+    """Sparse points that it sees; -1 where the format does not say."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class SparseModel:
 
     folder: Path
     suffix: str
-    """``.bin`` or ``.txt``."""
+    """``.bin`` or ``.txt``; the name of the one file of another format."""
     cameras: tuple[SparseCamera, ...]
     images: tuple[SparseImage, ...]
     point_ids: np.ndarray
@@ -103,7 +103,7 @@ class SparseModel:
 
     def file(self, stem: str) -> Path:
         """Path of ``cameras``, ``images`` or ``points3D``."""
-        return self.folder / f"{stem}{self.suffix}"
+        return self.folder / (f"{stem}{self.suffix}" if self.suffix[0] == "." else self.suffix)
 
 
 def model_faults(model: SparseModel) -> Iterator[Fault]:

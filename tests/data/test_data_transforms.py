@@ -1,0 +1,199 @@
+"""transforms.json and poses_bounds.npy are the scenes that they were made from."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from colmap_scenes import HEIGHT, WIDTH, picture, write_scene
+from PIL import Image
+from tiny_runs import composed
+
+from vlgs.check import check
+from vlgs.config import instantiate
+from vlgs.convert import convert
+from vlgs.data.colmap import load_scene
+from vlgs.data.faults import SceneError, errors
+from vlgs.data.sparse import read_cameras
+from vlgs.types import Scene
+
+CAMERAS: dict[str, tuple[float, ...]] = {
+    "PINHOLE": (20.0, 21.0, 12.5, 8.5),
+    "SIMPLE_PINHOLE": (20.0, 12.5, 8.5),
+    "SIMPLE_RADIAL": (20.0, 12.5, 8.5, 0.01),
+    "OPENCV": (20.0, 21.0, 12.5, 8.5, 0.01, -0.02, 0.001, 0.002),
+    "OPENCV_FISHEYE": (20.0, 21.0, 12.5, 8.5, 0.01, -0.02, 0.001, 0.002),
+    "FULL_OPENCV": (20.0, 21.0, 12.5, 8.5, 0.01, -0.02, 0.001, 0.002, 0.003, 0, 0, 0),
+}
+
+
+def moved(root: Path, target: Path, model: str) -> tuple[Scene, Scene]:
+    """A COLMAP scene, and the same photographs with transforms.json."""
+    write_scene(root, camera=(model, CAMERAS[model]), points=120)
+    target.mkdir()
+    (root / "images").rename(target / "images")
+    (root / "images").symlink_to(target / "images")
+    convert(root, target / "transforms.json")
+    return load_scene(str(root)), load_scene(str(target))
+
+
+def assert_same(got: Scene, want: Scene, atol: float = 1e-5) -> None:
+    assert torch.equal(got.point_colors, want.point_colors)
+    torch.testing.assert_close(got.points, want.points, atol=atol, rtol=0)
+    assert [v.name for v in got.train] == [v.name for v in want.train]
+    for ours, theirs in zip(got.train + got.test, want.train + want.test, strict=True):
+        torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=atol, rtol=0)
+        torch.testing.assert_close(ours.camera.K, theirs.camera.K, atol=1e-4, rtol=0)
+        assert torch.equal(ours.read_image(), theirs.read_image())
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_colmap_and_its_transforms_are_one_scene(tmp_path: Path, model: str):
+    want, got = moved(tmp_path / "a", tmp_path / "b", model)
+    assert_same(got, want)
+
+
+@pytest.mark.parametrize("name", ["colmap", "colmap-text"])
+def test_transforms_become_colmap(tmp_path: Path, name: str):
+    want, _ = moved(tmp_path / "a", tmp_path / "b", "OPENCV")
+    (tmp_path / "b" / "sparse").mkdir()
+    convert(tmp_path / "b" / "transforms.json", tmp_path / "b" / "sparse" / "0", name)
+    suffix = "bin" if name == "colmap" else "txt"
+    assert (tmp_path / "b" / "sparse" / "0" / f"images.{suffix}").is_file()
+    assert read_cameras(tmp_path / "b" / "sparse" / "0").suffix == f".{suffix}"
+    assert_same(load_scene(str(tmp_path / "b")), want)
+
+
+def frame(**keys: Any) -> dict[str, Any]:
+    """A camera at (1, 2, 3) that looks down the world's -z with y up: OpenGL's own axes."""
+    pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    return {"file_path": "./images/a.png", "transform_matrix": pose} | keys
+
+
+def written(folder: Path, *frames: dict[str, Any], **keys: Any) -> Path:
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for number, name in enumerate("ab"):
+        Image.fromarray(picture(number)).save(folder / "images" / f"{name}.png")
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({"frames": list(frames)} | keys))
+    return path
+
+
+LENS = {"fl_x": 20, "fl_y": 21, "cx": 12.5, "cy": 8.5, "w": WIDTH, "h": HEIGHT}
+
+
+def test_axes_are_opengls(tmp_path: Path):
+    model = read_cameras(written(tmp_path, frame(), **LENS))
+    # OpenCV's y and z point the other way: half a turn around x.
+    assert model.images[0].quat == pytest.approx((0, 1, 0, 0), abs=1e-12)
+    assert model.images[0].translation == pytest.approx((-1, 2, 3), abs=1e-12)
+    assert model.images[0].name == "a.png"
+    assert model.cameras[0].params == (20, 21, 12.5, 8.5)
+
+
+def test_what_nerfstudio_applied_is_undone(tmp_path: Path):
+    # nerfstudio's own choice: y and z swap places and the new z is turned round; the scale comes after it.
+    applied = np.array([[1.0, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0.25]])
+    plain = read_cameras(written(tmp_path / "a", frame(), **LENS)).images[0]
+    pose = np.array(frame()["transform_matrix"], float)
+    pose = np.vstack([applied, [0, 0, 0, 1]]) @ pose
+    pose[:3, 3] *= 0.2
+    moved_frame = frame(transform_matrix=pose.tolist())
+    keys = {"applied_transform": applied.tolist(), "applied_scale": 0.2}
+    back = read_cameras(written(tmp_path / "b", moved_frame, **LENS, **keys)).images[0]
+    assert back.quat == pytest.approx(plain.quat, abs=1e-12)
+    assert back.translation == pytest.approx(plain.translation, abs=1e-12)
+
+
+def test_what_instant_ngp_leaves_out_is_filled_in(tmp_path: Path):
+    other = frame(file_path="images/b")
+    model = read_cameras(written(tmp_path, frame(), other, camera_angle_x=1.2, aabb_scale=4))
+    (camera,) = model.cameras
+    assert (camera.width, camera.height, camera.model) == (WIDTH, HEIGHT, "PINHOLE")
+    focal = WIDTH / 2 / np.tan(0.6)
+    assert camera.params == pytest.approx((focal, focal, WIDTH / 2, HEIGHT / 2))
+    assert [image.name for image in model.images] == ["a.png", "b"]
+    assert len(load_scene(str(tmp_path), split="list", test=["b"]).train) == 1
+
+
+def test_intrinsics_per_frame(tmp_path: Path):
+    model = read_cameras(
+        written(tmp_path, frame(fl_x=30.0), frame(file_path="images/b.png"), **LENS)
+    )
+    assert [camera.params[0] for camera in model.cameras] == [30, 20]
+    assert [image.camera_id for image in model.images] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of .* got 'EQUIRECTANGULAR'"),
+        ({"k4": 0.1}, "without k4 unless fisheye, got OPENCV with k4 = 0.1"),
+        ({"fl_x": "wide"}, "frame 0, fl_x: value must be a number"),
+        ({"fl_x": float("nan")}, "frame 0, fl_x: value must be a number"),
+        ({"w": -4}, "frame 0, w: value must be a number of 1"),
+        ({"applied_scale": 0}, "applied_scale: value must be a number"),
+        ({"applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "applied_transform: matrix"),
+        ({"ply_file_path": "none.ply"}, "none.ply: ply_file_path must be a PLY"),
+        ({"frames": 3}, "content must be a JSON with frames"),
+        ({"frames": [{"file_path": 3}]}, "frame 0: file_path must be the path of an image"),
+        ({"frames": [frame(transform_matrix="x")]}, "frame 0: matrix must be a rotation"),
+        ({"frames": [frame(transform_matrix=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])]}, "matrix must be"),
+        ({"frames": []}, "registered images must be at least 1, got 0"),
+        ({"frames": [frame(file_path="../../a.png"), frame(file_path="b.png")]}, "path below the image folder"),
+    ],
+)  # fmt: skip
+def test_faults_are_named(tmp_path: Path, keys: dict[str, Any], message: str):
+    path = written(tmp_path, frame(), **(LENS | keys))
+    with pytest.raises(SceneError, match=message):
+        read_cameras(path)
+
+
+def test_as_a_data_source(tmp_path: Path):
+    moved(tmp_path / "a", tmp_path / "b", "OPENCV")
+    config = composed("data=nerfstudio", f"data.root={tmp_path / 'b'}").data
+    assert len(instantiate(config).train) == 7
+    assert not errors(check(config).faults)
+
+
+def test_llff_poses_are_the_scene(tmp_path: Path):
+    """3D-OVS as it was first released: poses_bounds.npy in place of COLMAP's files."""
+    write_scene(tmp_path, camera=("SIMPLE_PINHOLE", (20.0, WIDTH / 2, HEIGHT / 2)))
+    want = load_scene(str(tmp_path))
+    rows = []
+    for view in sorted((*want.train, *want.test), key=lambda view: view.name):
+        pose = view.camera.viewmat.double().inverse()
+        right, down, forward, center = pose[:3].T
+        columns = torch.stack(
+            [down, right, -forward, center, torch.tensor([HEIGHT, WIDTH, 20.0])], 1
+        )
+        rows.append([*columns.flatten().tolist(), 0.1, 10.0])
+    np.save(tmp_path / "poses_bounds.npy", np.array(rows))
+    for file in (tmp_path / "sparse" / "0").iterdir():
+        file.unlink()
+    got = load_scene(str(tmp_path))
+    assert len(got.points) == 0
+    for ours, theirs in zip(got.train + got.test, want.train + want.test, strict=True):
+        torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(ours.camera.K, theirs.camera.K)
+    np.save(tmp_path / "poses_bounds.npy", np.array(rows[:-1]))
+    with pytest.raises(
+        SceneError, match=r"finite floats \[9, 17\], a row for each image, got .*\[8, 17\]"
+    ):
+        load_scene(str(tmp_path))
+
+
+def test_the_fox_of_instant_ngp(shared: Path, tmp_path: Path):
+    fox = shared / "data" / "fox"
+    (tmp_path / "images").symlink_to(fox / "images")
+    content = json.loads((fox / "transforms_fullres.json").read_text())
+    # Made for 1080 x 1920 with a distorted lens; 50 of its 67 photographs are at hand, at half the size.
+    content["frames"] = [f for f in content["frames"] if (fox / f["file_path"]).is_file()]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(str(tmp_path))
+    assert len(scene.train) + len(scene.test) == 50
+    view = scene.train[0]
+    assert abs(view.camera.width - 540) < 20
+    assert view.read_image().shape[:2] == (view.camera.height, view.camera.width)

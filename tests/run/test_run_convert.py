@@ -1,0 +1,137 @@
+"""`python -m vlgs.convert` from the shell, and runs that start from what it reads."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny_runs import TINY, composed
+
+from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
+from vlgs.convert import convert, main
+from vlgs.gaussians import PARAMETERS, read_ply, write_ply
+from vlgs.interchange import write_autoencoder
+from vlgs.run import run
+from vlgs.types import Scene
+
+
+def some_gaussians(n: int = 40, width: int = 3) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shapes = {
+        "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "sh0": (n, 3), "shN": (n, 15, 3),
+        "opacity_logits": (n,), "indicator_logits": (n,), "features": (n, width),
+    }  # fmt: skip
+    params = {name: torch.randn(shapes[name], generator=generator) for name in PARAMETERS}
+    return params | {"log_scales": params["log_scales"] * 0.1 - 2}
+
+
+def test_the_command_says_what_it_did_and_what_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    write_ply(tmp_path / "a.ply", some_gaussians())
+    main([str(tmp_path / "a.ply"), str(tmp_path / "b.splat")])
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].endswith(
+        "b.splat: 40 Gaussians as 32 bytes a Gaussian; no view dependence, no language"
+    )
+    assert out[1:] == [
+        "not kept: spherical harmonics above degree 0",
+        "not kept: language features",
+        "not kept: indicators",
+    ]
+    assert (tmp_path / "b.splat").stat().st_size == 40 * 32
+    convert(tmp_path / "b.splat", tmp_path / "c.ply")  # without language: 3DGS's own columns
+    assert b"lang_0" not in (tmp_path / "c.ply").read_bytes()
+
+
+def test_a_chain_of_formats_ends_where_it_began(tmp_path: Path):
+    params = some_gaussians()
+    write_ply(tmp_path / "a.ply", params)
+    convert(tmp_path / "a.ply", tmp_path / "b.pth", "langsplat")
+    convert(tmp_path / "b.pth", tmp_path / "c.ply", "feature3dgs")
+    convert(tmp_path / "c.ply", tmp_path / "d.ply")
+    back = read_ply(tmp_path / "d.ply")
+    assert all(torch.equal(back[k], params[k]) for k in PARAMETERS if k != "indicator_logits")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none.ply", "b.ply"], "IN must exist"),
+        (["a.ply", "a.ply"], "OUT must be another path than IN"),
+        (["a.ply", "b.pth"], "OUT needs --as 3dgs or langsplat"),
+        (["a.ply", "b.obj"], "OUT must end in .ply, .splat, .pth, got b.obj"),
+        (["a.ply", "b.ply", "--as", "splat"], "OUT must end in .splat for --as splat"),
+        (["a.ply", "none/b.ply"], "No such file or directory"),
+        (["bad.splat", "b.ply"], "log_scales must be finite, got 2 of 2 rows that are not"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
+    tmp_path: Path, arguments: list[str], message: str
+):
+    write_ply(tmp_path / "a.ply", some_gaussians())
+    (tmp_path / "bad.splat").write_bytes(bytes(64))
+    before = sorted(tmp_path.iterdir())
+    paths = [str(tmp_path / name) for name in arguments[:2]]
+    with pytest.raises(SystemExit) as stopped:
+        main([*paths, *arguments[2:]])
+    assert str(stopped.value).startswith("error: ")
+    assert message in str(stopped.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_as_a_program(tmp_path: Path):
+    (tmp_path / "a.splat").write_bytes(bytes(32))
+    command = [sys.executable, "-m", "vlgs.convert", "a.splat", "b.ply", "--drop"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "left out: 1 rows, log_scales must be finite" in done.stdout
+
+
+def test_a_run_starts_from_a_file_and_its_content_is_part_of_the_id(tmp_path: Path):
+    write_ply(tmp_path / "a.ply", some_gaussians(200))
+    convert(tmp_path / "a.ply", tmp_path / "copy.ply")
+    options = [
+        *TINY,
+        f"results={tmp_path}",
+        "trainer=smoke",
+        "trainer.iterations=2",
+        "pictures=false",
+    ]
+
+    def go(name: str) -> set[str]:
+        assert run(composed(*options, f"gaussians.init={tmp_path / name}")) == 0
+        return {path.name for path in (tmp_path / "runs").iterdir()}
+
+    (first,) = go("a.ply")
+    assert go("copy.ply") == {first}  # the same content elsewhere is the same run
+    metrics = json.loads((tmp_path / "runs" / first / "metrics.json").read_text())
+    assert metrics["n_gaussians"] == 200
+    moved = read_ply(tmp_path / "runs" / first / "point_cloud.ply")["means"]
+    assert (moved - some_gaussians(200)["means"]).abs().max() < 0.1
+    write_ply(tmp_path / "copy.ply", some_gaussians(100))
+    assert len(go("copy.ply")) == 2
+
+
+def test_a_run_takes_the_weights_of_an_autoencoder(tmp_path: Path, tiny_scene: Scene):
+    codec = Autoencoder(training=AutoencoderTraining(steps=20))
+    codec.fit(tiny_scene.mask_vectors, tiny_scene.mask_areas)
+    write_autoencoder(tmp_path / "best_ckpt.pth", codec)
+    weights = f"codec.weights={tmp_path / 'best_ckpt.pth'}"
+    options = [
+        *TINY,
+        f"results={tmp_path}",
+        "trainer=smoke",
+        "trainer.iterations=1",
+        "pictures=false",
+    ]
+    assert run(composed(*options, weights)) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    (saved,) = (folder / "checkpoint").glob("*.safetensors")
+    kept = load_file(saved)["model.codec.encoder.0.weight"]
+    assert torch.equal(kept, codec.state_dict()["encoder.0.weight"])
+    with pytest.raises(FileNotFoundError, match="weights must be a file"):
+        run(composed(*options, "codec.weights=nowhere.pth"))

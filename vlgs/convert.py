@@ -1,0 +1,127 @@
+"""From one format to another: `python -m vlgs.convert IN OUT`; see `--help`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from vlgs.data.sparse import read_cameras, write_transforms
+from vlgs.data.sparse.write import write_colmap
+from vlgs.interchange import (
+    FORMATS,
+    compress_language,
+    read_autoencoder,
+    read_gaussians,
+    write_autoencoder,
+    write_gaussians,
+)
+
+_HELP = """Formats, by suffix; --as says which where a suffix has several:
+
+  Gaussians     IN .ply .splat .pth -> OUT {gaussians}
+  autoencoder   IN best_ckpt.pth -> OUT .safetensors (ours), or back
+  language      IN language_features/ --codec best_ckpt.pth -> OUT language_features_dim3/
+  cameras       IN a scene's folder (COLMAP) or transforms.json -> OUT transforms.json, or a folder for COLMAP's files
+
+Rows that are not finite or have no rotation are counted, and refuse the file; --drop leaves them out."""
+_COLMAP = ("colmap", "colmap-text")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Convert one file or folder; exit status 1 with one line if it cannot be done."""
+    gaussians = ", ".join(f"{suffix} ({name})" for name, (suffix, _) in FORMATS.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m vlgs.convert",
+        description=__doc__,
+        epilog=_HELP.format(gaussians=gaussians),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source", type=Path, metavar="IN")
+    parser.add_argument("target", type=Path, metavar="OUT")
+    names = [*FORMATS, *_COLMAP]
+    parser.add_argument("--as", dest="name", choices=names, help="format of OUT")
+    parser.add_argument("--codec", type=Path, help="autoencoder that makes codes of language maps")
+    parser.add_argument("--drop", action="store_true", help="leave broken Gaussians out")
+    given = parser.parse_args(arguments)
+    try:
+        for line in convert(given.source, given.target, given.name, given.codec, given.drop):
+            sys.stdout.write(f"{line}\n")
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+
+
+def convert(
+    source: Path,
+    target: Path,
+    name: str | None = None,
+    codec: Path | None = None,
+    drop: bool = False,
+) -> list[str]:
+    """Read, write, and say in a few lines what was done and what was lost.
+
+    Raises:
+        FileNotFoundError: If there is no source.
+        ValueError: If the two do not fit together, or the source is damaged.
+        OSError: If the target cannot be written.
+    """
+    if not source.exists():
+        raise FileNotFoundError(f"convert: IN must exist, got {source}")
+    if source.resolve() == target.resolve():
+        raise ValueError(f"convert: OUT must be another path than IN, got {target}")
+    if codec is not None:
+        count = compress_language(source, target, read_autoencoder(codec))
+        return [f"{target}: language codes of {count} views"]
+    if source.is_dir() or source.suffix == ".json":
+        return _convert_cameras(source, target, name)
+    if source.suffix == ".safetensors" or target.suffix == ".safetensors":
+        return _convert_autoencoder(source, target)
+    return _convert_gaussians(source, target, name, drop)
+
+
+def _convert_gaussians(source: Path, target: Path, name: str | None, drop: bool) -> list[str]:
+    matching = [key for key, (suffix, _) in FORMATS.items() if suffix == target.suffix]
+    if name is None and not matching:
+        suffixes = ", ".join(dict.fromkeys(suffix for suffix, _ in FORMATS.values()))
+        raise ValueError(f"convert: OUT must end in {suffixes}, got {target.name}")
+    if name is None and len(matching) > 1 and target.suffix != ".ply":
+        raise ValueError(
+            f"convert: OUT needs --as {' or '.join(matching)}, got {target.name} alone"
+        )
+    if name is not None and name not in matching:
+        suffix = FORMATS[name][0] if name in FORMATS else "nothing, as cameras do,"
+        raise ValueError(f"convert: OUT must end in {suffix} for --as {name}, got {target}")
+    read = read_gaussians(source, drop=drop)
+    if name is None and target.suffix == ".ply":
+        name = "vlgs" if read.has_language else "3dgs-ply"
+    name = name or matching[0]
+    lost = write_gaussians(target, read, name)
+    lines = [f"{target}: {len(read.params['means'])} Gaussians as {FORMATS[name][1]}"]
+    lines += [f"left out: {count} rows, {what}" for what, count in read.dropped.items()]
+    return lines + [f"not kept: {what}" for what in lost]
+
+
+def _convert_autoencoder(source: Path, target: Path) -> list[str]:
+    from safetensors.torch import save
+
+    from vlgs.files import write_atomically
+
+    codec = read_autoencoder(source)
+    if target.suffix == ".safetensors":
+        write_atomically(target, save(codec.state_dict()))
+    else:
+        write_autoencoder(target, codec)
+    return [f"{target}: autoencoder {codec.mean.shape[0]} -> {codec.dim}"]
+
+
+def _convert_cameras(source: Path, target: Path, name: str | None) -> list[str]:
+    model = read_cameras(source)
+    if target.suffix == ".json":
+        write_transforms(target, model)
+    elif name not in (None, *_COLMAP):
+        raise ValueError(f"convert: cameras go to {' or '.join(_COLMAP)}, got --as {name}")
+    else:
+        write_colmap(target, model, text=name == "colmap-text")
+    return [f"{target}: {len(model.images)} images, {len(model.points)} points"]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,265 @@
+"""nerfstudio's and instant-ngp's ``transforms.json`` as a `SparseModel`, and back.
+
+Camera-to-world matrices with OpenGL axes (x right, y up, z back); intrinsics for all frames or per frame. What nerfstudio applied to
+the original world (``applied_transform``, ``applied_scale``) is undone, so that a COLMAP scene and its transforms.json are one scene.
+instant-ngp records no such thing: its world stays as it is. Points come from ``ply_file_path``, if there is one.
+"""
+
+import io
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from PIL import Image
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from vlgs.data.faults import Fault, SceneError
+from vlgs.data.images import UNREADABLE
+from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
+from vlgs.files import write_atomically
+from vlgs.geometry import quat_to_rotmat, rotmat_to_quat
+
+FILE = "transforms.json"
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL camera axes <-> OpenCV's."""
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MOST = 1e9
+
+
+def read_transforms(path: Path) -> SparseModel:
+    """Cameras, poses and points of a file; image names are relative to the folder that holds all images.
+
+    Sizes that are missing come from the image files, a missing principal point is the middle, a missing focal length comes from
+    ``camera_angle_x`` (radians across the width).
+
+    Raises:
+        SceneError: Names the frame and the key that is wrong.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        frames = content["frames"]
+        if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
+            raise TypeError("frames is not a list of mappings")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        what = f"content must be a JSON with frames, got {type(error).__name__}: {error}"
+        raise SceneError(Fault(str(path), what)) from error
+    unturn, scale = _applied(path, content)
+    names = [_name(path, number, frame) for number, frame in enumerate(frames)]
+    shared = _shared_folder(names)
+    cameras: dict[tuple[Any, ...], SparseCamera] = {}
+    images = []
+    for number, (frame, name) in enumerate(zip(frames, names, strict=True)):
+        where = f"frame {number}"
+        lens = _lens(path, where, {**content, **frame}, path.parent / name)
+        camera = cameras.setdefault(lens, SparseCamera(len(cameras) + 1, *lens))
+        pose = _matrix(path, where, frame.get("transform_matrix"))
+        pose[:3, 3] /= scale
+        viewmat = np.linalg.inv(unturn @ pose @ _FLIP)
+        quat = rotmat_to_quat(torch.from_numpy(viewmat[:3, :3]))
+        images.append(
+            SparseImage(
+                number + 1,
+                camera.camera_id,
+                str(name.relative_to(shared)),
+                tuple(quat.tolist()),
+                tuple(viewmat[:3, 3].tolist()),
+                observations=-1,
+            )
+        )
+    points, colors = _read_points(path, content)
+    points = points / scale @ unturn[:3, :3].T + unturn[:3, 3]
+    ids = np.arange(1, len(points) + 1)
+    return SparseModel(
+        path.parent, FILE, tuple(cameras.values()), tuple(images), ids, points, colors
+    )
+
+
+def write_transforms(path: Path, model: SparseModel, images: str = "images") -> None:
+    """Write nerfstudio's file, and the points beside it as ``sparse_pc.ply``.
+
+    Args:
+        path: The JSON; its folder must exist.
+        model: Its cameras must be perspective or OPENCV_FISHEYE.
+        images: Folder of the photographs, relative to the file's.
+
+    Raises:
+        ValueError: If a camera's model has no place in the format.
+        OSError: If a file cannot be written.
+    """
+    lenses = {camera.camera_id: _written_lens(path, camera) for camera in model.cameras}
+    frames = []
+    for image in model.images:
+        viewmat = np.eye(4)
+        quat = torch.tensor(image.quat, dtype=torch.float64)
+        viewmat[:3, :3] = quat_to_rotmat(quat).numpy()
+        viewmat[:3, 3] = image.translation
+        frame: dict[str, Any] = {
+            "file_path": str(PurePosixPath(images) / image.name),
+            "transform_matrix": (np.linalg.inv(viewmat) @ _FLIP).tolist(),
+        }
+        frames.append(frame if len(lenses) == 1 else frame | lenses[image.camera_id])
+    content: dict[str, Any] = dict(next(iter(lenses.values()))) if len(lenses) == 1 else {}
+    if len(model.points):
+        rows = np.empty(
+            len(model.points),
+            [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")],
+        )
+        for column, axis in enumerate("xyz"):
+            rows[axis] = model.points[:, column]
+        for column, channel in enumerate(("red", "green", "blue")):
+            rows[channel] = model.point_colors[:, column]
+        stream = io.BytesIO()
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
+        write_atomically(path.parent / "sparse_pc.ply", stream.getvalue())
+        content["ply_file_path"] = "sparse_pc.ply"
+    content["frames"] = frames
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _name(path: Path, number: int, frame: Mapping[str, Any]) -> PurePosixPath:
+    name = frame.get("file_path")
+    if not isinstance(name, str) or not name.strip():
+        what = f"file_path must be the path of an image, got {name!r}"
+        raise SceneError(Fault(str(path), what, where=f"frame {number}"))
+    return PurePosixPath(name.replace("\\", "/"))
+
+
+def _shared_folder(names: list[PurePosixPath]) -> PurePosixPath:
+    """Deepest folder that holds them all."""
+    shared = names[0].parent if names else PurePosixPath()
+    while not all(name.is_relative_to(shared) for name in names):
+        shared = shared.parent
+    return shared
+
+
+def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Float64[np.ndarray, "4 4"], float]:
+    """What undoes the transform that nerfstudio applied, and the scale that it applied after it."""
+    applied = np.eye(4)
+    if "applied_transform" in content:
+        applied = _matrix(path, "applied_transform", content["applied_transform"])
+    scale = _number(path, "applied_scale", content.get("applied_scale", 1.0), least=1e-9)
+    return np.linalg.inv(applied), scale
+
+
+def _matrix(path: Path, where: str, value: Any) -> Float64[np.ndarray, "4 4"]:
+    """A rotation and a translation: 3 x 4, or 4 x 4 with the last row that it must have."""
+    try:
+        rows = np.array(value, np.float64)
+    except (ValueError, TypeError):
+        rows = np.zeros(0)
+    what = "matrix must be a rotation and a translation, 3 x 4 or 4 x 4"
+    if rows.shape not in ((3, 4), (4, 4)) or not (np.abs(rows) <= _MOST).all():
+        raise SceneError(Fault(str(path), f"{what}, got {str(value)[:80]}", where=where))
+    matrix = np.eye(4)
+    matrix[:3] = rows[:3]
+    turn = matrix[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+        raise SceneError(Fault(str(path), f"{what}, got axes {turn.tolist()}", where=where))
+    return matrix
+
+
+def _lens(
+    path: Path, where: str, keys: Mapping[str, Any], image: Path
+) -> tuple[str, int, int, tuple[float, ...]]:
+    """Model, width, height and parameters in COLMAP's terms."""
+
+    def number(key: str, default: float | None = None, least: float = -_MOST) -> float:
+        value = keys.get(key)
+        return _number(path, f"{where}, {key}", default if value is None else value, least)
+
+    if keys.get("w") is None or keys.get("h") is None:
+        width, height = _image_size(path, where, image)
+    else:
+        width, height = int(number("w", least=1.0)), int(number("h", least=1.0))
+    if keys.get("fl_x") is None and keys.get("camera_angle_x") is not None:
+        focal = width / 2 / math.tan(number("camera_angle_x", least=1e-3) / 2)
+    else:
+        focal = number("fl_x", least=1e-3)
+    if keys.get("fl_y") is None and keys.get("camera_angle_y") is not None:
+        other = height / 2 / math.tan(number("camera_angle_y", least=1e-3) / 2)
+    else:
+        other = number("fl_y", focal, least=1e-3)
+    pinhole = (focal, other, number("cx", width / 2), number("cy", height / 2))
+    k1, k2, k3, k4, p1, p2 = (number(key, 0.0) for key in _DISTORTION)
+    model = keys.get("camera_model", "OPENCV_FISHEYE" if keys.get("is_fisheye") else "OPENCV")
+    if model == "OPENCV_FISHEYE":
+        return model, width, height, (*pinhole, k1, k2, k3, k4)
+    if model not in _PERSPECTIVE or k4:
+        known = ", ".join((*_PERSPECTIVE, "OPENCV_FISHEYE"))
+        got = f"{model} with k4 = {k4}" if model in _PERSPECTIVE else repr(model)
+        what = f"camera_model must be one of {known}, without k4 unless fisheye, got {got}"
+        raise SceneError(Fault(str(path), what, where=where))
+    if k3:
+        return "FULL_OPENCV", width, height, (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    if any((k1, k2, p1, p2)):
+        return "OPENCV", width, height, (*pinhole, k1, k2, p1, p2)
+    return "PINHOLE", width, height, pinhole
+
+
+def _number(path: Path, where: str, value: Any, least: float = -_MOST) -> float:
+    if type(value) not in (int, float) or not least <= value <= _MOST:
+        what = f"value must be a number of {least:g} to {_MOST:g}, got {value!r}"
+        raise SceneError(Fault(str(path), what, where=where))
+    return float(value)
+
+
+def _image_size(path: Path, where: str, image: Path) -> tuple[int, int]:
+    found = (
+        image
+        if image.is_file()
+        else next(iter(sorted(image.parent.glob(f"{image.name}.*"))), image)
+    )
+    try:
+        with Image.open(found) as opened:
+            return opened.size
+    except UNREADABLE as error:
+        what = f"w and h must be given or {image} must be an image, got {error}"
+        raise SceneError(Fault(str(path), what, where=where)) from error
+
+
+def _read_points(
+    path: Path, content: Mapping[str, Any]
+) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
+    name = content.get("ply_file_path")
+    if name is None:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    file = path.parent / str(name)
+    try:
+        vertices = PlyData.read(str(file))["vertex"].data
+        points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        channels = [vertices[name].astype(np.uint8) for name in ("red", "green", "blue")]
+    except (OSError, PlyParseError, UnicodeDecodeError, ValueError, KeyError, MemoryError) as error:
+        what = "ply_file_path must be a PLY with x y z red green blue"
+        raise SceneError(
+            Fault(str(file), f"{what}, got {type(error).__name__}: {error}")
+        ) from error
+    return points, np.stack(channels, axis=1)
+
+
+def _written_lens(path: Path, camera: SparseCamera) -> dict[str, Any]:
+    keys = {
+        "SIMPLE_PINHOLE": (),
+        "PINHOLE": (),
+        "SIMPLE_RADIAL": ("k1",),
+        "RADIAL": ("k1", "k2"),
+        "OPENCV": ("k1", "k2", "p1", "p2"),
+        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    }.get(camera.model)
+    fx, fy, cx, cy = camera.intrinsics()
+    bent = camera.params[len(camera.params) - len(keys or ()) :]
+    if keys is None or (camera.model == "FULL_OPENCV" and any(bent[5:])):
+        what = "cameras must be perspective with k1, k2, k3, p1, p2, or OPENCV_FISHEYE"
+        raise ValueError(f"transforms {path}: {what}, got {camera.model} {camera.params}")
+    fisheye = camera.model == "OPENCV_FISHEYE"
+    named = {key: value for key, value in zip(keys, bent, strict=True) if key in _DISTORTION}
+    model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if named else "PINHOLE"
+    sizes = {"w": camera.width, "h": camera.height}
+    focal = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    return {"camera_model": model, **sizes, **focal, **named}

@@ -1,0 +1,22 @@
+"""What other systems write, in and out: Gaussians, checkpoints, autoencoders, language maps, cameras.
+
+Nothing here runs code from a file: pickles are read by torch's own restricted reader, which knows tensors and plain values.
+"""
+
+from vlgs.interchange.autoencoder import load_weights, read_autoencoder, write_autoencoder
+from vlgs.interchange.gaussians import FORMATS, Imported, read_gaussians, write_gaussians
+from vlgs.interchange.language import compress_language
+from vlgs.interchange.start import file_digest, start_from
+
+__all__ = [
+    "FORMATS",
+    "Imported",
+    "compress_language",
+    "file_digest",
+    "load_weights",
+    "read_autoencoder",
+    "read_gaussians",
+    "start_from",
+    "write_autoencoder",
+    "write_gaussians",
+]

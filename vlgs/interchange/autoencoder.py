@@ -1,0 +1,109 @@
+"""LangSplat's autoencoder weights (systems.md C.5) as our codec, and back."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from vlgs.codec.autoencoder import Autoencoder
+from vlgs.interchange.plain import load_plain, save_plain
+
+
+def read_autoencoder(path: str | Path) -> Autoencoder:
+    """A codec with the weights of a ``best_ckpt.pth``, or of our own state dict as safetensors, whatever its widths.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not the state dict of such an autoencoder; names the layer that does not fit.
+    """
+    who = f"autoencoder {path}"
+    state = _load(Path(path))
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise ValueError(f"{who}: must be a state dict of tensors, got a {type(state).__name__}")
+    encoder, decoder = _widths(state, "encoder"), _widths(state, "decoder")
+    if len(encoder) < 3 or len(decoder) < 3:
+        what = "must have encoder.0.weight, ... and decoder.0.weight, ... of two layers or more"
+        raise ValueError(f"{who}: {what}, got {len(encoder)} and {len(decoder)} widths")
+    if encoder[-1] != decoder[0] or encoder[0] != decoder[-1]:
+        raise ValueError(f"{who}: decoder must undo {encoder}, got {decoder}")
+    codec = Autoencoder(encoder[-1], encoder[1:-1], decoder[1:-1], center="mean" in state)
+    codec.build(encoder[0])
+    own = {"mean": codec.mean, "fitted_reconstruction": codec.fitted_reconstruction}
+    try:
+        codec.load_state_dict({**own, **state})
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ValueError(f"{who}: layers must be LangSplat's, got {reason}") from None
+    weights = (item for item in state.items() if item[0] != "fitted_reconstruction")
+    bad = [name for name, value in weights if not value.isfinite().all()]
+    if bad:
+        raise ValueError(f"{who}: weights must be finite, got {bad[0]} that is not")
+    codec.requires_grad_(False)
+    return codec
+
+
+def load_weights(codec: Autoencoder, path: str | Path) -> None:
+    """Give a codec the weights of a file, in place of a fit.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no autoencoder, or one of other widths.
+    """
+    read = read_autoencoder(path)
+    own = (codec.encoder_widths, codec.dim, codec.decoder_widths)
+    widths = (read.encoder_widths, read.dim, read.decoder_widths)
+    if own != widths:
+        raise ValueError(f"autoencoder {path}: widths must be {own} as configured, got {widths}")
+    codec.load_state_dict(read.state_dict())
+    codec.requires_grad_(False)
+
+
+def _load(path: Path) -> Any:
+    if path.suffix != ".safetensors":
+        return load_plain(path)
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        if not path.is_file():
+            raise FileNotFoundError(f"autoencoder {path}: file must exist, got none") from None
+        raise ValueError(f"autoencoder {path}: must be safetensors, got {error}") from None
+
+
+def write_autoencoder(path: str | Path, codec: Autoencoder) -> None:
+    """Write a fitted codec as LangSplat reads it.
+
+    LangSplat subtracts no mean: ours goes into the first and the last bias, which gives the same codes and embeddings up to
+    float32 rounding.
+
+    Raises:
+        ValueError: If the codec is not fitted.
+        OSError: If the file cannot be written.
+    """
+    state = dict(codec.state_dict())
+    if "encoder.0.weight" not in state:
+        raise ValueError(f"autoencoder {path}: codec must be fitted, got one that is not")
+    mean = state.pop("mean").double()
+    state.pop("fitted_reconstruction")
+    last = max(int(name.split(".")[1]) for name in state if name.startswith("decoder."))
+    weight, bias = state["encoder.0.weight"].double(), state["encoder.0.bias"].double()
+    state["encoder.0.bias"] = (bias - weight @ mean).float()
+    state[f"decoder.{last}.bias"] = (state[f"decoder.{last}.bias"].double() + mean).float()
+    save_plain(path, {name: value.detach().clone() for name, value in state.items()})
+
+
+def _widths(state: Mapping[str, Any], part: str) -> list[int]:
+    """Widths from input to output: those of the weights that are matrices, in the order of the layers."""
+    matrices = {
+        int(name.split(".")[1]): value
+        for name, value in state.items()
+        if isinstance(value, torch.Tensor)
+        and value.dim() == 2
+        and name.startswith(f"{part}.")
+        and name.split(".")[1].isdecimal()
+    }
+    shapes = [matrices[index].shape for index in sorted(matrices)]
+    return [shapes[0][1], *(shape[0] for shape in shapes)] if shapes else []

@@ -1,0 +1,106 @@
+"""Gaussians of any system, by the suffix of their file."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from vlgs.gaussians.parameters import complete
+from vlgs.gaussians.ply import parse_ply, write_ply
+from vlgs.gaussians.sound import drop_broken, require_sound
+from vlgs.interchange.checkpoint import parse_checkpoint, write_checkpoint
+from vlgs.interchange.splat import parse_splat, write_splat
+
+FORMATS: Mapping[str, tuple[str, str]] = {
+    "vlgs": (".ply", "3DGS PLY with lang_* and indicator"),
+    "3dgs-ply": (".ply", "3DGS PLY"),
+    "feature3dgs": (".ply", "3DGS PLY with semantic_*"),
+    "splat": (".splat", "32 bytes a Gaussian; no view dependence, no language"),
+    "3dgs": (".pth", "3DGS checkpoint, 12 values"),
+    "langsplat": (".pth", "LangSplat checkpoint, 13 values"),
+}
+"""Name -> suffix and what it is."""
+
+_CHECKPOINTS = (".pth", ".pt", ".ckpt")
+
+
+@dataclass(frozen=True)
+class Imported:
+    """Gaussians from a file."""
+
+    params: Mapping[str, Tensor]
+    """All of `vlgs.gaussians.PARAMETERS`."""
+    has_language: bool
+    """Whether the features came from the file."""
+    langsplat: bool
+    """Whether the file is a checkpoint of LangSplat, whose features are normalised before they are rendered."""
+    dropped: Mapping[str, int]
+    """What was wrong with how many rows that were left out."""
+
+
+def read_gaussians(path: str | Path, feature_dim: int = 3, drop: bool = False) -> Imported:
+    """Read a PLY of 3DGS, Feature-3DGS or ours, a ``.splat``, or a checkpoint of 3DGS or LangSplat.
+
+    Args:
+        path: The file; its suffix tells the format.
+        feature_dim: Width of the language codes, all zero, where the file has none.
+        drop: Leave out rows that are not finite or whose quaternion is zero, instead of refusing the file.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not of its format, or holds such rows; names the file, what is wrong and how many rows.
+    """
+    path = Path(path)
+    if path.suffix == ".ply":
+        params = parse_ply(path)
+    elif path.suffix == ".splat":
+        params = parse_splat(path)
+    elif path.suffix in _CHECKPOINTS:
+        params, _ = parse_checkpoint(path)
+    else:
+        raise ValueError(
+            f"gaussians: file must end in .ply, .splat or {', '.join(_CHECKPOINTS)}, got {path.name}"
+        )
+    params, dropped = drop_broken(params) if drop else (params, {})
+    require_sound(f"{path.suffix[1:]} {path}", params)
+    language = "features" in params
+    in_checkpoint = path.suffix in _CHECKPOINTS
+    return Imported(complete(params, feature_dim), language, language and in_checkpoint, dropped)
+
+
+def write_gaussians(path: str | Path, imported: Imported, name: str) -> tuple[str, ...]:
+    """Write Gaussians in a format of `FORMATS`.
+
+    Returns:
+        What the format has no place for and the Gaussians had.
+
+    Raises:
+        ValueError: If there is no such format, a row is broken, or the format needs language that is not there.
+        OSError: If the file cannot be written.
+    """
+    params = imported.params
+    require_sound(f"{name} {path}", params)
+    if name in ("feature3dgs", "langsplat") and not imported.has_language:
+        raise ValueError(f"{name} {path}: Gaussians must carry language features, got none")
+    if name in ("vlgs", "3dgs-ply", "feature3dgs"):
+        dialect = "3dgs" if name == "3dgs-ply" else name
+        write_ply(path, params, dialect)
+    elif name == "splat":
+        write_splat(path, params)
+    elif name in ("3dgs", "langsplat"):
+        write_checkpoint(path, params, language=name == "langsplat")
+    else:
+        raise ValueError(f"convert: format must be one of {', '.join(FORMATS)}, got {name}")
+    return tuple(_lost(imported, name))
+
+
+def _lost(imported: Imported, name: str) -> list[str]:
+    params, lost = imported.params, []
+    if name == "splat" and params["shN"].abs().sum() > 0:
+        lost.append("spherical harmonics above degree 0")
+    if name in ("splat", "3dgs-ply", "3dgs") and imported.has_language:
+        lost.append("language features")
+    if name != "vlgs" and not params["indicator_logits"].equal(params["opacity_logits"]):
+        lost.append("indicators")
+    return lost

@@ -1,0 +1,44 @@
+"""LangSplat's ``language_features`` -> ``language_features_dim3``: the codes of an autoencoder in place of the embeddings (C.4)."""
+
+from pathlib import Path
+
+import torch
+
+from vlgs.codec import Codec
+from vlgs.data.language import find_mask_files, read_mask_map, read_mask_vectors, write_mask_files
+
+
+def compress_language(source: Path, target: Path, codec: Codec) -> int:
+    """Write the maps of a folder again, with codes for vectors.
+
+    Args:
+        source: With ``<stem>_s.npy`` and ``<stem>_f.npy``.
+        target: Made if it is not there; files of the same names are replaced.
+        codec: Fitted to the width of the vectors.
+
+    Returns:
+        How many views were written.
+
+    Raises:
+        FileNotFoundError: If there are no maps.
+        ValueError: If a file is damaged, or its vectors have another width than the codec.
+        OSError: If a file cannot be written.
+    """
+    stems = sorted(path.name.removesuffix("_s.npy") for path in source.glob("*_s.npy"))
+    pairs = [(stem, find_mask_files(source, stem)) for stem in stems]
+    if not stems or any(files is None for _, files in pairs):
+        lone = next((stem for stem, files in pairs if files is None), "nothing")
+        what = "must hold <stem>_s.npy and <stem>_f.npy"
+        raise FileNotFoundError(f"language {source}: {what}, got {lone} of it")
+    target.mkdir(parents=True, exist_ok=True)
+    for stem, files in pairs:
+        assert files is not None
+        vectors = torch.from_numpy(read_mask_vectors(files))
+        with torch.no_grad():
+            try:
+                codes = codec.encode(vectors)
+            except RuntimeError as error:
+                what = "vectors must be as wide as the autoencoder's input"
+                raise ValueError(f"language {files.vectors}: {what}, got {error}") from None
+        write_mask_files(target, stem, read_mask_map(files), codes.numpy())
+    return len(pairs)
