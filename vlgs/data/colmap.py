@@ -148,6 +148,30 @@ def survey(source: ColmapSource) -> Survey:
     return Survey(tuple(faults), model, views, scene)
 
 
+def open_training_views(source: ColmapSource, every_view: bool = False) -> tuple[ViewSource, ...]:
+    """The views that language maps are read for, whether there are any maps or not: what `vlgs.features` works on.
+
+    Args:
+        source: The scene; its language maps and vocabulary are left aside.
+        every_view: Whether test views are wanted too.
+
+    Raises:
+        FileNotFoundError: If the scene is not there.
+        SceneError: For the first thing wrong with its cameras, photographs, labels or split.
+    """
+    folder, suffix = _require_tree(source)
+    model = read_sparse(folder, suffix)
+    faults = FaultList(model_faults(model))
+    images = ImageFolder(Path(source.root) / source.images, source.resize, PixelCache(0))
+    views = faults.take(open_views(model, images))
+    labels = faults.take(_open_labels(source))
+    views = faults.take(attach_labels(views, labels, images))
+    faults += source.rule.faults(*_names(views), source.root)
+    require_sound(faults)
+    train, _ = source.rule.divide(*_names(views))
+    return tuple(view for view in views if every_view or view.name in set(train))
+
+
 def _require_tree(source: ColmapSource) -> tuple[Path, str]:
     """Folder and suffix of the sparse files."""
     root = Path(source.root)
