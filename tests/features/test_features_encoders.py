@@ -63,7 +63,7 @@ def test_other_towers_of_transformers_encode_too(tmp_path: Path, kind: str):
         config = SiglipConfig(text_config=text, vision_config={**vision, "intermediate_size": 16})
         model = SiglipModel(config)
     else:
-        model = Dinov2Model(Dinov2Config(**vision))
+        model = Dinov2Model(Dinov2Config.from_dict(vision))
     model.save_pretrained(tmp_path / "model")
     settings = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "size": {"height": 16}}
     (tmp_path / "model" / "preprocessor_config.json").write_text(json.dumps(settings))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from colmap_scenes import write_model, write_scene
+from colmap_scenes import write_model, write_scene  # pyright: ignore[reportMissingImports]
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image
@@ -166,9 +166,9 @@ def test_maps_of_another_program_are_not_mixed_with(scene: Path, weights: Path):
 def test_a_dry_run_writes_nothing(scene: Path, weights: Path):
     lines = list(job.estimate(job.plan(config(scene, weights, *QUICK))))
     assert lines[0].startswith("photographs 7 to do of 7")
-    assert "measured on one photograph" in lines[1]
+    assert "masks as frame_00001 has" in lines[1]
     assert "min," in lines[2]
-    assert "masks on 70 x 50" in lines[2]
+    assert "70 x 50" in lines[2]
     assert not (scene / "language_features").exists()
     lines = list(job.estimate(job.plan(config(scene, scene))))
     assert "hf download facebook/sam-vit-huge" in lines[2]
@@ -250,6 +250,7 @@ def test_every_option_composes_and_keeps_the_contract(group: str, option: str):
     check_targets(given)
     extractor = instantiate(given.features.extractor)
     assert isinstance(extractor, Extractor)
+    assert isinstance(extractor, MaskExtractor)
     assert isinstance(extractor.segmenter, Segmenter)
     assert isinstance(extractor.encoder, Encoder)
 

@@ -144,7 +144,7 @@ class MaskExtractor:
         norms = np.linalg.norm(vectors, axis=1, keepdims=True)
         wrong = np.flatnonzero(~(np.isfinite(norms[:, 0]) & (norms[:, 0] > 0)))
         if len(wrong):
-            box = list(distinct.values())[wrong[0]].box
+            box = list(distinct.values())[int(wrong[0])].box
             raise ValueError(
                 f"features: vectors of {stem} must be finite and not zero, got length {norms[wrong[0], 0]} for the mask "
                 f"in box {box} and {len(wrong) - 1} others"

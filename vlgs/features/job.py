@@ -151,31 +151,26 @@ def estimate(job: Job) -> Iterator[str]:
     yield f"photographs {len(todo)} to do of {len(job.views)}, to {job.folder.path}"
     if not todo:
         return
-    vectors, width = 400, 512  # a usual SAM photograph; measured below where that can be
-    seconds: float | None = None
+    vectors, width = 400, 512  # a usual SAM photograph; measured where that can be
+    guess = f"if a photograph has {vectors} masks"
     try:
         job.folder.require_same(job.settings())
         image = job.pixels(todo[0])
         job.extractor(image[:64, :64], todo[0].name)  # loads the weights, which is not to be timed
         start = time.perf_counter()
-        features = job.extractor(image, todo[0].name)
+        vectors, width = job.extractor(image, todo[0].name).vectors.shape
         seconds = time.perf_counter() - start
-        vectors, width = features.vectors.shape
     except FileNotFoundError as error:
-        missing = str(error)
+        needed = f"unknown: {error}"
     else:
-        missing = ""
-    size = sum(pair_bytes(map_size(v, job.max_height), vectors, width) for v in todo)
-    guess = "measured on one photograph" if seconds else "if a photograph has 400 masks"
-    yield f"disk        {size / 2**20:.0f} MiB, {guess}"
-    if seconds is None:
-        yield f"time        unknown: {missing}"
-    else:
-        whole = seconds * len(todo)
-        yield (
-            f"time        {whole / 60:.1f} min, {seconds:.1f} s a photograph "
-            f"({todo[0].name}: {vectors} masks on {image.shape[1]} x {image.shape[0]})"
+        guess = f"if all have {vectors} masks as {todo[0].name} has"
+        needed = (
+            f"{seconds * len(todo) / 60:.1f} min, {seconds:.1f} s a photograph of "
+            f"{image.shape[1]} x {image.shape[0]}"
         )
+    size = sum(pair_bytes(map_size(v, job.max_height), vectors, width) for v in todo)
+    yield f"disk        {size / 2**20:.0f} MiB, {guess}"
+    yield f"time        {needed}"
 
 
 def map_size(view: ViewSource, max_height: int | None) -> tuple[int, int]:

@@ -99,24 +99,21 @@ def remove_small_regions(mask: Mask, size: tuple[int, int], least: int) -> tuple
 
     Holes are filled first. Where every island is small the largest stays.
     """
-    from scipy import ndimage
-
     top, left = min(mask.y, 1), min(mask.x, 1)
     _, _, x2, y2 = mask.box
     pads = ((top, int(y2 < size[0])), (left, int(x2 < size[1])))
     pixels = np.pad(mask.pixels, pads)  # one row more on each side: there the outside is connected
     ring = np.pad(np.zeros(mask.pixels.shape, bool), pads, constant_values=True)
-    eight = np.ones((3, 3), bool)
-    labels, _ = ndimage.label(~pixels, eight)
+    labels = _regions(~pixels)
     areas = np.bincount(labels.ravel())
     areas[np.unique(labels[ring])] = least  # goes on outside of the box
     areas[0] = least
     filled = pixels | (areas < least)[labels]
-    labels, count = ndimage.label(filled, eight)
+    labels = _regions(filled)
     areas = np.bincount(labels.ravel())
     large = areas >= least
     large[0] = False
-    if count and not large.any():
+    if not large.any():
         large[1 + areas[1:].argmax()] = True
     cleaned = large[labels]
     if np.array_equal(cleaned, pixels):
@@ -124,3 +121,12 @@ def remove_small_regions(mask: Mask, size: tuple[int, int], least: int) -> tuple
     result = crop_mask(cleaned, mask.x - left, mask.y - top)
     assert result is not None
     return result, True
+
+
+def _regions(pixels: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
+    """Numbers of the 8-connected regions, from 1; 0 elsewhere."""
+    from scipy import ndimage
+
+    labels = np.zeros(pixels.shape, np.int32)
+    ndimage.label(pixels, np.ones((3, 3), bool), output=labels)
+    return labels

@@ -173,7 +173,7 @@ class SamSegmenter:
         """The image encoder's answer: scaled to `inner` by Pillow as SAM does, zeros below and to the right."""
         model, mean, std = self._model()
         side = model.config.vision_config.image_size
-        scaled = Image.fromarray(pixels).resize(inner[::-1], Image.Resampling.BILINEAR)
+        scaled = Image.fromarray(pixels).resize((inner[1], inner[0]), Image.Resampling.BILINEAR)
         planes = torch.from_numpy(np.array(scaled)).permute(2, 0, 1)[None] / 255
         planes = (planes - mean[:, None, None]) / std[:, None, None]
         planes = F.pad(planes, (0, side - inner[1], 0, side - inner[0]))
