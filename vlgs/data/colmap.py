@@ -21,7 +21,13 @@ from vlgs.data.cache import PixelCache
 from vlgs.data.faults import Fault, FaultList, SceneError, errors, require_sound
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
 from vlgs.data.language import read_vocabulary
-from vlgs.data.masks import MaskTable, gather_masks, missing_faults
+from vlgs.data.masks import (
+    MaskTable,
+    gather_masks,
+    missing_faults,
+    stray_faults,
+    width_warnings,
+)
 from vlgs.data.registered import ImageFolder, attach_labels, coverage_warnings, open_views
 from vlgs.data.sparse import SparseModel, find_sparse, model_faults, read_sparse
 from vlgs.data.split import Split
@@ -220,7 +226,12 @@ def _open_masks(
     train, _ = source.rule.divide(*_names(views))
     training = [view for view in views if view.name in set(train)]
     table, found = gather_masks(training, folder, source.level)
-    return table, (*found, *missing_faults(table, training, folder, source.allow_missing_masks))
+    return table, (
+        *found,
+        *missing_faults(table, training, folder, source.allow_missing_masks),
+        *stray_faults(folder, _names(views)[0]),
+        *width_warnings(table, folder),
+    )
 
 
 def _open_vocabulary(
