@@ -132,7 +132,7 @@ class MaskExtractor:
             rows = np.full(len(masks) + 1, -1, np.int32)
             rows[used + 1] = len(shown) + np.arange(len(used), dtype=np.int32)
             ids[level] = rows[painted + 1]
-            shown += [masks[i] for i in used]
+            shown += [masks[i] for i in used.tolist()]
         return MaskFeatures(ids, self._encode(image, shown, stem))
 
     def _encode(self, image: np.ndarray, masks: Sequence[Mask], stem: str) -> np.ndarray:
