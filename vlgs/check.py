@@ -1,5 +1,6 @@
 """Is this scene usable? `python -m vlgs.check data=colmap data.root=PATH` lists every fault; exit status 1 if one is an error."""
 
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from torch import Tensor
 from vlgs.config import CONF, check_targets, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
+from vlgs.data.plausible import plausibility_warnings
 from vlgs.types import IGNORE_ID, Scene, View
 
 _COLMAP = "vlgs.data.colmap.load_scene"
@@ -32,6 +34,9 @@ def main(config: DictConfig) -> None:
     try:
         check_targets(config)
         report = check(config.data)
+        if not errors(report.faults):
+            line, doubts = training_memory(config)
+            report = Report((*report.faults, *doubts), (*report.summary, line))
     except MissingMandatoryValue as error:
         sys.exit(f"error: {error.full_key} must be given")
     except (ValueError, OSError) as error:
@@ -72,6 +77,7 @@ def check_scene(scene: Scene) -> Iterator[Fault]:
         yield warning(
             scene.name, "test views should be at least 1, got 0", "nothing will be measured"
         )
+    yield from plausibility_warnings(scene, _views(scene))
     known = set(scene.vocabulary.names) if scene.vocabulary else set()
     if scene.vocabulary and (unknown := [name for name in scene.classes if name not in known]):
         what = f"vocabulary should know every class, got none for {listing(unknown)}"
@@ -123,6 +129,24 @@ def summarize(scene: Scene) -> Iterator[str]:
     yield f"memory      {decoded / 2**20:.0f} MiB for all photographs and masks, decoded"
 
 
+def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
+    """What a run with this configuration may need for its Gaussians, as a line of the summary, and a doubt about it.
+
+    Value, gradient and Adam's two moments of every parameter at `gaussians.max_count`; images and activations come on top.
+    """
+    gaussians = config.gaussians
+    geometry, weights = 3 + 4 + 3, 2  # means, quats, scales; opacity and indicator
+    parameters = geometry + weights + 3 * (gaussians.sh_degree + 1) ** 2
+    parameters += OmegaConf.select(config, "codec.dim", default=512)
+    needed = gaussians.max_count * parameters * 4 * 4
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    line = f"training    {needed / 2**20:.0f} MiB for {gaussians.max_count} Gaussians at most, with their optimiser"
+    if needed <= there / 2:
+        return line, ()
+    what = f"Gaussians should take at most half of the memory ({there / 2**20:.0f} MiB), got {needed / 2**20:.0f} MiB"
+    return line, (warning("gaussians.max_count", what, "lower it"),)
+
+
 def print_report(report: Report) -> None:
     """Summary, then errors, then warnings, then the verdict."""
     console = Console(soft_wrap=True, highlight=False, markup=False)
@@ -159,4 +183,6 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]
 
 
 if __name__ == "__main__":
+    if {"--help", "-h"} & set(sys.argv):
+        sys.argv.append("hydra/help=check")
     main()

@@ -119,6 +119,11 @@ def test_crossings(polygon: list, expected: bool):
             "not cross itself",
         ),
         (
+            entry(segmentation=[[1, 2], [5, 6], [9, 10]], bbox=(1, 2, 9, 10)),
+            "warning",
+            "must enclose an area, got corners on a line",
+        ),
+        (
             entry(segmentation=[[1, 15], [1, 19], [3, 19]], bbox=(15, 1, 19, 3)),
             "error",
             "lie in the image",

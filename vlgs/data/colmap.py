@@ -21,7 +21,13 @@ from vlgs.data.cache import PixelCache
 from vlgs.data.faults import Fault, FaultList, SceneError, errors, listing, require_sound
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
 from vlgs.data.language import read_vocabulary
-from vlgs.data.masks import MaskTable, gather_masks, missing_faults
+from vlgs.data.masks import (
+    MaskTable,
+    gather_masks,
+    missing_faults,
+    stray_faults,
+    width_warnings,
+)
 from vlgs.data.registered import ImageFolder, attach_labels, coverage_warnings, open_views
 from vlgs.data.sparse import SparseModel, find_sparse, model_faults, read_sparse
 from vlgs.data.split import Split
@@ -164,6 +170,30 @@ def survey(source: ColmapSource) -> Survey:
     return Survey(tuple(faults), model, views, scene)
 
 
+def open_training_views(source: ColmapSource, every_view: bool = False) -> tuple[ViewSource, ...]:
+    """The views that language maps are read for, whether there are any maps or not: what `vlgs.features` works on.
+
+    Args:
+        source: The scene; its language maps and vocabulary are left aside.
+        every_view: Whether test views are wanted too.
+
+    Raises:
+        FileNotFoundError: If the scene is not there.
+        SceneError: For the first thing wrong with its cameras, photographs, labels or split.
+    """
+    folder, suffix = _require_tree(source)
+    model = read_sparse(folder, suffix)
+    faults = FaultList(model_faults(model))
+    images = ImageFolder(Path(source.root) / source.images, source.resize, PixelCache(0))
+    views = faults.take(open_views(model, images))
+    labels = faults.take(_open_labels(source))
+    views = faults.take(attach_labels(views, labels, images))
+    faults += source.rule.faults(*_names(views), source.root)
+    require_sound(faults)
+    train, _ = source.rule.divide(*_names(views))
+    return tuple(view for view in views if every_view or view.name in set(train))
+
+
 def _require_tree(source: ColmapSource) -> tuple[Path, str]:
     """Folder and suffix of the sparse files."""
     found = find_sparse(source.folder)
@@ -247,7 +277,12 @@ def _open_masks(
     train, _ = source.rule.divide(*_names(views))
     training = [view for view in views if view.name in set(train)]
     table, found = gather_masks(training, folder, source.level)
-    return table, (*found, *missing_faults(table, training, folder, source.allow_missing_masks))
+    return table, (
+        *found,
+        *missing_faults(table, training, folder, source.allow_missing_masks),
+        *stray_faults(folder, _names(views)[0]),
+        *width_warnings(table, folder),
+    )
 
 
 def _open_vocabulary(

@@ -1,7 +1,7 @@
 """The masks of all training views as one table of vectors (`vlgs.types.Scene.mask_vectors`)."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from vlgs.data.faults import Fault, SceneError, listing
+from vlgs.data.faults import Fault, SceneError, listing, warning
 from vlgs.data.language import find_mask_files, mask_map_size, read_mask_vectors
 from vlgs.data.views import ViewSource, map_sizes
 
@@ -90,6 +90,36 @@ def missing_faults(
         yield Fault(str(folder), what, advice)
     if table.sources and not len(table.vectors):
         yield Fault(str(folder), "masks of the chosen level must reach a pixel, got -1 everywhere")
+
+
+def stray_faults(folder: Path, stems: Collection[str]) -> Iterator[Fault]:
+    """Files that would silently not be read: halves of a pair, and maps of no photograph.
+
+    Args:
+        folder: Of language maps.
+        stems: Of all registered photographs.
+    """
+    halves = {
+        kind: {p.name.removesuffix(f"_{kind}.npy") for p in folder.glob(f"*_{kind}.npy")}
+        for kind in "sf"
+    }
+    for kind, other in ("sf", "fs"):
+        if alone := sorted(halves[kind] - halves[other]):
+            what = f"language maps must be pairs, got <stem>_{kind}.npy without <stem>_{other}.npy for {listing(alone, 5)}"
+            yield warning(folder, what, "neither is read: make them again")
+    if stray := sorted((halves["s"] & halves["f"]) - set(stems)):
+        what = f"language maps should belong to a registered photograph, got others: {listing(stray, 5)}"
+        yield warning(folder, what, "they are not read; maps are matched by the photograph's stem")
+
+
+def width_warnings(table: MaskTable, folder: Path) -> Iterator[Fault]:
+    """Vectors that seem to be codes already."""
+    if len(table.vectors) and table.vectors.shape[1] == 3:
+        what = "vectors should be those of an encoder (512 wide for CLIP ViT-B/16), got 3 wide"
+        advice = (
+            "these look like LangSplat's codes (language_features_dim3): take language_features"
+        )
+        yield warning(folder, what, advice)
 
 
 def _read_view(source: ViewSource) -> ViewMasks:

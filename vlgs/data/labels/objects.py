@@ -218,6 +218,12 @@ def _geometry_faults(item: LabelledObject, size: tuple[int, int]) -> Iterator[Fa
         guess = "x and y are swapped" if np.abs(swapped - item.box).max() <= 5 else "they disagree"
         what = f"{item.category}: bbox must bound the polygon {bounds}, got {item.box}"
         yield warning("", what, guess)
+    x, y = item.polygon.T
+    if abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) < 1 and not crosses_itself(
+        item.polygon
+    ):
+        what = f"{item.category}: polygon must enclose an area, got corners on a line"
+        yield warning("", what, "its outline is what is labelled")
     if crosses_itself(item.polygon):
         what = f"{item.category}: polygon must not cross itself, got a crossing"
         yield warning("", what, "the even-odd rule fills it")

@@ -1,0 +1,69 @@
+"""What a sound scene may still have against it: doubts for `vlgs.check`, never errors."""
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.data.faults import Fault, listing, warning
+from vlgs.types import Scene, View
+
+_NEAR = 0.01
+"""World units before a camera within which nothing is drawn (`RasterConfig.near`)."""
+
+_TOO_CLOSE = 0.01
+"""Share of a view's median depth; a point nearer than this fills the image."""
+
+
+def plausibility_warnings(scene: Scene, views: Sequence[View]) -> Iterator[Fault]:
+    """Scale of the world, points at cameras, labels that are not tested, categories that are one word spelled twice."""
+    yield from _scale_warnings(scene, views)
+    labelled = {v.name for v in views if v.read_dense_labels or v.read_object_labels}
+    tested = labelled & {v.name for v in scene.test}
+    if labelled and scene.test and not tested:
+        what = f"labelled views should be tested, got {len(labelled)} of which none is held out"
+        yield warning(scene.name, what, "nothing is scored: set data.split=holdout")
+    by_key: dict[str, list[str]] = {}
+    for name in scene.classes:
+        by_key.setdefault("".join(filter(str.isalnum, name.casefold())), []).append(name)
+    if twice := [name for names in by_key.values() if len(names) > 1 for name in names]:
+        what = f"classes should differ in more than spelling, got {listing(map(repr, twice))}"
+        yield warning(scene.name, what, "each is scored as a class of its own")
+
+
+def _scale_warnings(scene: Scene, views: Sequence[View]) -> Iterator[Fault]:
+    """Depths of the sparse points, view by view."""
+    medians, close, blind = [], [], []
+    for view in views:
+        depth = _visible_depths(scene.points, view)
+        if not len(depth):
+            blind.append(view.name)
+            continue
+        medians.append(depth.median())
+        if (depth < _TOO_CLOSE * medians[-1]).any():
+            close.append(view.name)
+    if not medians:
+        return
+    median = float(torch.stack(medians).median())
+    if not 10 * _NEAR <= median <= 1e5:
+        what = f"median depth of the points should be {10 * _NEAR} to 100000 world units, got {median:.3g}"
+        advice = f"what is nearer than {_NEAR} is not drawn: scale the model"
+        yield warning(scene.name, what, advice)
+    if close:
+        what = f"points should keep 1 % of a view's median depth from its camera, got nearer ones in {listing(close, 5)}"
+        yield warning(scene.name, what, "their Gaussians begin as blobs before the lens")
+    if blind:
+        what = f"views should see a sparse point, got none in {listing(blind, 5)}"
+        yield warning(scene.name, what, "wrong pose, or nothing was triangulated there")
+
+
+def _visible_depths(points: Float[Tensor, "p 3"], view: View) -> Float[Tensor, " v"]:
+    """Depths of the points that project into the image."""
+    camera = view.camera
+    x = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    x = x[x[:, 2] > 0]
+    pixel = x @ camera.K.T
+    xy = pixel[:, :2] / pixel[:, 2:]
+    inside = (xy >= 0).all(dim=1) & (xy < torch.tensor([camera.width, camera.height])).all(dim=1)
+    return x[inside, 2]

@@ -1,0 +1,1 @@
+"""Cameras from photographs alone, through COLMAP: `python -m vlgs.sfm IMAGES OUT`."""

@@ -1,0 +1,281 @@
+"""From a folder of photographs to a scene that ``data=colmap`` reads, or to nothing at all."""
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from vlgs.data.faults import listing
+from vlgs.data.images import SUFFIXES, UNREADABLE
+from vlgs.files import write_atomically
+
+REPORT = "sfm.json"
+
+_EXHAUSTIVE_UP_TO = 120
+"""Photographs beyond which matching=auto goes through them in order: 120 make 7140 pairs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmOptions:
+    """How cameras are found.
+
+    Raises:
+        ValueError: If an option is out of range.
+    """
+
+    matching: str = "auto"
+    """exhaustive (every pair), sequential (neighbours by name: a video), auto (by number of photographs)."""
+    overlap: int = 10
+    """Neighbours on each side, with matching=sequential."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """A model of COLMAP's; OPENCV for strong distortion."""
+    single_camera: bool | None = None
+    """Whether one camera took them all; None: if all have one size."""
+    max_size: int = 3200
+    """Larger photographs are shrunk to this for finding features."""
+    max_features: int = 8192
+    """In one photograph."""
+    undistort: bool = False
+    """Whether photographs are written as a pinhole camera sees them. vlgs does that itself, with one interpolation less."""
+    threads: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.matching not in ("auto", "exhaustive", "sequential"):
+            raise ValueError(
+                f"sfm: matching must be auto, exhaustive or sequential, got {self.matching}"
+            )
+        if min(self.overlap, self.threads, self.max_size, self.max_features) < 1 or self.seed < 0:
+            raise ValueError(f"sfm: numbers must be positive, got {self}")
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What came out."""
+
+    photographs: int
+    registered: int
+    points: int
+    reprojection_error: float
+    """Mean over the points, in pixels."""
+    models: int
+    """Parts that were found; the largest is the scene."""
+    missing: tuple[str, ...]
+    """Names of the photographs without a camera."""
+
+
+def reconstruct(images: Path, out: Path, options: SfmOptions, console: Console) -> Reconstruction:
+    """Find the cameras of all photographs of a folder and write a scene.
+
+    The work lies in ``.<out>.sfm`` beside the scene until that is whole; the same call takes up what is there.
+
+    Args:
+        images: Folder of photographs; subfolders count.
+        out: Folder to be made: ``images/``, ``sparse/0/`` and ``sfm.json``.
+        options: How.
+        console: For the progress bar.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        FileExistsError: If `out` is there already and not empty.
+        ValueError: If photographs cannot be read, or no cameras are found; it says what to do.
+        RuntimeError: If COLMAP stops; it says where its log is.
+    """
+    names, single = _photographs(images)
+    if out.is_dir() and any(out.iterdir()):
+        raise FileExistsError(f"sfm: {out} must not exist or be empty, got a folder with files")
+    chosen = asdict(options)
+    if options.single_camera is None:
+        chosen["single_camera"] = single
+    if options.matching == "auto":
+        many = len(names) > _EXHAUSTIVE_UP_TO
+        chosen["matching"] = "sequential" if many else "exhaustive"
+    work = out.with_name(f".{out.name}.sfm")
+    _prepare(work, {**chosen, "images": str(images.resolve()), "names": names})
+    _run(work, console, len(names), _pairs(len(names), chosen["matching"], options.overlap))
+    models = json.loads((work / "models.json").read_text(encoding="utf-8"))
+    if not models:
+        raise ValueError(
+            f"sfm: photographs must overlap, got no two of {len(names)} in {images} that COLMAP could join; {ADVICE}"
+        )
+    best = max(models, key=lambda model: len(model["registered"]))
+    registered = set(best["registered"])
+    result = Reconstruction(
+        photographs=len(names),
+        registered=len(registered),
+        points=best["points"],
+        reprojection_error=best["reprojection_error"],
+        models=len(models),
+        missing=tuple(name for name in names if name not in registered),
+    )
+    sparse = work / "sparse" / best["folder"]
+    _assemble(work, sparse, None if options.undistort else images, out, result)
+    return result
+
+
+ADVICE = (
+    "take photographs in which each thing is seen from several places (move, do not only turn), sharp and with at least 60 % "
+    "overlap; use --matching exhaustive if names are not in order, --overlap 20 for a fast video, --camera OPENCV for a wide "
+    "lens, --max-features 16384 for plain walls; leave out blurred ones"
+)
+
+
+def _photographs(images: Path) -> tuple[list[str], bool]:
+    """Names below the folder, in order, and whether all have one size."""
+    if not images.is_dir():
+        raise FileNotFoundError(f"sfm: images must be a folder of photographs, got {images}")
+    paths = sorted(p for p in images.rglob("*") if p.suffix.lower() in SUFFIXES)
+    sizes, broken = set(), []
+    for path in paths:
+        try:
+            with Image.open(path) as image:
+                sizes.add(image.size)
+        except UNREADABLE as error:
+            broken.append(f"{path.name} ({error})")
+    if broken:
+        raise ValueError(f"sfm: photographs must be readable, got {listing(broken)}")
+    if len(paths) < 3:
+        raise ValueError(f"sfm: photographs must be at least 3, got {len(paths)} in {images}")
+    stems = [path.stem for path in paths]
+    if len(set(stems)) < len(stems):
+        twice = sorted({stem for stem in stems if stems.count(stem) > 1})
+        raise ValueError(
+            f"sfm: photographs must have different names, got {listing(twice)} more than once"
+        )
+    return [path.relative_to(images).as_posix() for path in paths], len(sizes) == 1
+
+
+def _prepare(work: Path, settings: dict[str, Any]) -> None:
+    """The work folder, emptied if it was for other settings."""
+    file = work / "settings.json"
+    text = json.dumps(settings, indent=2)
+    if file.is_file() and file.read_text(encoding="utf-8") != text:
+        shutil.rmtree(work)
+    elif work.is_dir() and not file.is_file() and any(work.iterdir()):
+        raise FileExistsError(f"sfm: {work} must be a folder of an earlier run, got other files")
+    work.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, text.encode())
+
+
+def _run(work: Path, console: Console, photographs: int, pairs: int) -> None:
+    """Start the worker and watch what it has done until it ends."""
+    stages = {"features": photographs, "matches": pairs, "mapping": photographs}
+    (work / "stage.txt").unlink(missing_ok=True)
+    columns = (
+        TextColumn("{task.description:<12}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    command = [sys.executable, "-P", str(Path(__file__).with_name("worker.py")), str(work)]
+    with (work / "log.txt").open("wb") as log, Progress(*columns, console=console) as bar:
+        tasks = {
+            name: bar.add_task(name, total=total, start=False) for name, total in stages.items()
+        }
+        worker = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        try:
+            started: set[str] = set()
+            while True:
+                ended = worker.poll() is not None
+                for name, done in _done(work):
+                    if name not in started:
+                        bar.start_task(tasks[name])
+                        started.add(name)
+                    bar.update(tasks[name], completed=min(done, stages[name]))
+                if ended:
+                    break
+                time.sleep(0.2)
+        finally:
+            if worker.poll() is None:
+                worker.terminate()
+                with suppress(subprocess.TimeoutExpired):
+                    worker.wait(timeout=10)
+                worker.kill()
+    if worker.returncode != 0 or _stage(work) != "done":
+        lines = (work / "log.txt").read_text(encoding="utf-8", errors="replace").splitlines()
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "nothing")
+        how = (
+            f"signal {-worker.returncode}"
+            if worker.returncode < 0
+            else f"status {worker.returncode}"
+        )
+        raise RuntimeError(
+            f"sfm: COLMAP must end well, got {how} at stage {_stage(work)}: {last}; its log is {work / 'log.txt'}, the same "
+            "command goes on from what is there"
+        )
+
+
+def _done(work: Path) -> Iterator[tuple[str, int]]:
+    """Stage -> what the worker has done of it, for the stages that began."""
+    stage = _stage(work)
+    if stage == "not started":
+        return
+    database = work / "database.db"
+    if database.is_file():
+        # Read while it is written: where it is locked, the next look tells.
+        with (
+            suppress(sqlite3.Error),
+            closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as base,
+        ):
+            yield "features", base.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0]
+            if stage != "features":
+                rows = base.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
+                yield "matches", rows
+    registered = work / "registered.txt"
+    if stage in ("mapping", "undistortion", "done") and registered.is_file():
+        yield "mapping", registered.stat().st_size + 1  # the first call is for two
+
+
+def _stage(work: Path) -> str:
+    with suppress(OSError):
+        return (work / "stage.txt").read_text(encoding="utf-8") or "not started"
+    return "not started"
+
+
+def _pairs(count: int, matching: str, overlap: int) -> int:
+    """Pairs that COLMAP matches."""
+    if matching == "exhaustive":
+        return count * (count - 1) // 2
+    apart = {*range(1, overlap + 1), *(2**i for i in range(overlap))}
+    return sum(max(0, count - distance) for distance in apart)
+
+
+def _assemble(
+    work: Path, sparse: Path, images: Path | None, out: Path, result: Reconstruction
+) -> None:
+    """Put the scene together beside the work and move it to its place in one step.
+
+    All photographs go along, so that `vlgs.check` can name those without a camera. Where `images` is None they are the
+    undistorted ones.
+    """
+    scene = work / "scene"
+    shutil.rmtree(scene, ignore_errors=True)
+    if images is None:
+        scene.mkdir()
+        shutil.copytree(work / "undistorted" / "images", scene / "images")
+        sparse = work / "undistorted" / "sparse"
+    else:
+        for name in json.loads((work / "settings.json").read_text(encoding="utf-8"))["names"]:
+            target = scene / "images" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(images / name, target)
+    shutil.copytree(sparse, scene / "sparse" / "0")
+    text = json.dumps(asdict(result), indent=2) + "\n"
+    write_atomically(scene / REPORT, text.encode())
+    os.sync()
+    scene.rename(out)
+    shutil.rmtree(work, ignore_errors=True)

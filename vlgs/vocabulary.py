@@ -1,0 +1,94 @@
+"""Vectors of words for `data.vocabulary`: `python -m vlgs.vocabulary words.txt SCENE/language_features/vocabulary.npz`."""
+
+import argparse
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vlgs.files import write_atomically
+from vlgs.query.relevancy import CANONICAL_NEGATIVES
+from vlgs.query.text import CLIP_MODEL, ClipText, TextEncoder
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read words, encode them, write them; exit status 1 and one message where that cannot be."""
+    parser = argparse.ArgumentParser(prog="python -m vlgs.vocabulary", description=__doc__)
+    parser.add_argument(
+        "words", type=Path, help="text file, a word or phrase a line; # starts a comment"
+    )
+    parser.add_argument("out", type=Path, help="npz to write")
+    parser.add_argument(
+        "--model",
+        default=CLIP_MODEL,
+        help="name in the hub's cache or folder with tokenizer (%(default)s)",
+    )
+    parser.add_argument(
+        "--template",
+        default="{}",
+        help='sentence around a word, e.g. "a photo of a {}" (%(default)s)',
+    )
+    parser.add_argument(
+        "--no-negatives",
+        action="store_true",
+        help=f"leave out {', '.join(CANONICAL_NEGATIVES)}, which query=lerf_relevancy compares with",
+    )
+    args = parser.parse_args(arguments)
+    try:
+        words = read_words(args.words)
+        if not args.no_negatives:
+            words += [word for word in CANONICAL_NEGATIVES if word not in words]
+        write_vocabulary(args.out, words, ClipText(model=args.model), args.template)
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    print(f"{len(words)} words: {args.out}")
+
+
+def read_words(path: Path) -> list[str]:
+    """The words of a text file, one a line, without blank lines and comments.
+
+    Raises:
+        ValueError: If it is no UTF-8 text, has no words or one of them twice.
+        OSError: If it cannot be read.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: content must be UTF-8 text, got {error}") from error
+    words = [word for line in lines if (word := line.partition("#")[0].strip())]
+    twice = sorted({word for word in words if words.count(word) > 1})
+    if twice:
+        raise ValueError(f"{path}: words must be unique, got {', '.join(twice[:5])} more than once")
+    if not words:
+        raise ValueError(f"{path}: words must be at least one, got none")
+    return words
+
+
+def write_vocabulary(
+    path: Path, words: Sequence[str], encoder: TextEncoder, template: str = "{}"
+) -> None:
+    """Write an npz of `names` and `embeddings`, as `data.vocabulary` reads it.
+
+    Args:
+        path: To be replaced, whole or not at all.
+        words: What can be asked for later, spelled like this.
+        encoder: What gives each of them a vector.
+        template: Sentence that each is put into at ``{}`` before it is encoded.
+
+    Raises:
+        ValueError: If the template has no place for the word, or a word cannot be encoded.
+        OSError: If weights are missing or the file cannot be written.
+    """
+    if template.count("{}") != 1:
+        raise ValueError(f"vocabulary: template must contain {{}} once, got {template!r}")
+    vectors = encoder.encode([template.replace("{}", word) for word in words])
+    buffer = io.BytesIO()
+    np.savez(buffer, names=np.array(words), embeddings=vectors.numpy())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, buffer.getvalue())
+
+
+if __name__ == "__main__":
+    main()
