@@ -6,18 +6,17 @@
 
 namespace vlgs::VLGS_ISA_NS {
 
-template <class T>
+template <class T, int kSide = 1>
 struct Offset {
-  Pack<T> u, v;      // the pixel in the ellipse's own coordinates
-  Pack<T> exponent;  // u^2 + v^2, never negative; weights fall off as 2^-exponent
+  Pack<T, kSide> u, v;      // the pixel in the ellipse's own coordinates
+  Pack<T, kSide> exponent;  // u^2 + v^2, never negative; weights fall off as 2^-exponent
 };
 
-template <class T>
-VLGS_INLINE Offset<T> offset(const T *g, const Pack<T> &x, const Pack<T> &y) {
-  const Pack<T> dx = x - splat(g[kMeanX]), dy = y - splat(g[kMeanY]);
-  Offset<T> o;
-  o.u = splat(g[kInvSigmaX]) * fnma(splat(g[kSlope]), dy, dx);
-  o.v = splat(g[kInvSigmaY]) * dy;
+VLGS_PACK VLGS_INLINE Offset<T, kSide> offset(const T *g, const Pack<T, kSide> &x, const Pack<T, kSide> &y) {
+  const Pack<T, kSide> dx = x - splat<kSide>(g[kMeanX]), dy = y - splat<kSide>(g[kMeanY]);
+  Offset<T, kSide> o;
+  o.u = splat<kSide>(g[kInvSigmaX]) * fnma(splat<kSide>(g[kSlope]), dy, dx);
+  o.v = splat<kSide>(g[kInvSigmaY]) * dy;
   o.exponent = fma(o.u, o.u, o.v * o.v);
   return o;
 }
@@ -39,8 +38,10 @@ inline Centres<T> centres(const Grid &grid, int64_t tile, int b) {
 // Copies the records of a tile's list next to each other.
 template <class T>
 inline void gather_records(const Pass<T> &p, int64_t begin, int64_t end, T *to) {
-  for (int64_t k = begin; k < end; ++k, to += kRecord)
+  for (int64_t k = begin; k < end; ++k, to += kRecord) {
     store(to, load(p.records + int64_t(p.ranks[k]) * kRecord));
+    to[kPlace] = T(k - begin);
+  }
 }
 
 // Hands out pieces of one scratch array.

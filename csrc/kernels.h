@@ -16,6 +16,7 @@ constexpr int kBlocks = 16;        // blocks of a tile, and bits of a block mask
 constexpr int kPixels = 16;        // pixels of a block, row by row
 constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
 constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
+constexpr int kListSlack = 16;     // entries that a block's list may be written beyond its end
 constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
 
 // Exponents are in octaves: weight falls off as 2^-(u^2 + v^2) with u, v scaled by kOctaves = sqrt(log2(e) /
@@ -61,7 +62,16 @@ struct Box {
 };
 
 // A record: what the tile kernels read of a visible Gaussian, one cache line of floats.
-enum Record { kMeanX, kMeanY, kInvSigmaX, kSlope, kInvSigmaY, kChains0, kValues = kChains0 + 2 * kMaxChains };
+enum Record {
+  kMeanX,
+  kMeanY,
+  kInvSigmaX,
+  kSlope,
+  kInvSigmaY,
+  kChains0,
+  kValues = kChains0 + 2 * kMaxChains,
+  kPlace = kRecord - 1  // in the list of the tile at hand
+};
 constexpr int kWeight = 0, kCutoff = 1;  // record[kChains0 + 2 chain + ...]
 
 // One group of channels; several may hang on one chain.
@@ -105,7 +115,8 @@ struct Pass {
 };
 
 // A slot: gradients of one Gaussian from one tile. Moments are sums over pixels of h, the loss's derivative
-// by the negative exponent, times u, v, u^2, u v, v^2 (README.md). The channels of the parts follow.
+// by the negative exponent, times u, v, u^2, u v, v^2; a chain's own part of the sum of h is weight times the
+// gradient of the weight (README.md). The channels of the parts follow.
 enum Slot {
   kMomentU,
   kMomentV,

@@ -146,7 +146,7 @@ void Blend<T>::render(Stage &s, int threads) const {
   s.last = Buffer<T>(pixels);
   p.transmittance = s.transmittance.data(), p.last = s.last.data();
   const Kernels<T> &kernel = kernels<T>();
-  const int64_t size = kernel.blend_scratch(p, lists_.longest), list_size = lists_.longest + 1;
+  const int64_t size = kernel.blend_scratch(p, lists_.longest), list_size = lists_.longest + kListSlack;
   const Buffer<T> scratch(threads * size);
   const Buffer<uint32_t> list(threads * list_size);
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
@@ -217,7 +217,11 @@ void Blend<T>::write_gradients(const Stage &s, const Buffer<T> &sums, const Blen
     T *d_mean = d.d_mean2d + 2 * i, *d_ellipse = d.d_ellipse + 3 * i;
     if (first) std::fill(d_mean, d_mean + 2, T(0)), std::fill(d_ellipse, d_ellipse + 3, T(0));
     const T *sum = seen ? sums.data() + order_.rank_of[i] * p.slot_size : kNothing;
-    for (int c = 0; c < p.chains; ++c) d.d_weights[s.first_chain + c][i] = sum[kSlotWeight0 + c];
+    const T *g = seen ? p.records + order_.rank_of[i] * int64_t(kRecord) : kNothing;
+    for (int c = 0; c < p.chains; ++c) {
+      const T weight = g[kChains0 + 2 * c + kWeight];
+      d.d_weights[s.first_chain + c][i] = weight > 0 ? sum[kSlotWeight0 + c] / weight : T(0);
+    }
     for (int k = 0; k < p.num_parts; ++k) {
       const Part<T> &part = p.parts[k];
       T *to = d.d_values[s.first_part + k] + i * part.channels;
@@ -226,7 +230,6 @@ void Blend<T>::write_gradients(const Stage &s, const Buffer<T> &sums, const Blen
     }
     if (!seen) continue;
     if (any_not_finite(sum, p.slot_size)) bad = true;
-    const T *g = p.records + order_.rank_of[i] * int64_t(kRecord);
     const T a = g[kInvSigmaX], slope = g[kSlope], b = g[kInvSigmaY];
     d_mean[0] += kPerOctave2 * a * sum[kMomentU];
     d_mean[1] += kPerOctave2 * (b * sum[kMomentV] - a * slope * sum[kMomentU]);
