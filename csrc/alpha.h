@@ -6,17 +6,18 @@
 
 namespace vlgs::VLGS_ISA_NS {
 
-template <class T, int kSide = 1>
+template <class T>
 struct Offset {
-  Pack<T, kSide> u, v;      // the pixel in the ellipse's own coordinates
-  Pack<T, kSide> exponent;  // u^2 + v^2, never negative; weights fall off as 2^-exponent
+  Pack<T> u, v;      // the pixel in the ellipse's own coordinates
+  Pack<T> exponent;  // u^2 + v^2, never negative; weights fall off as 2^-exponent
 };
 
-VLGS_PACK VLGS_INLINE Offset<T, kSide> offset(const T *g, const Pack<T, kSide> &x, const Pack<T, kSide> &y) {
-  const Pack<T, kSide> dx = x - splat<kSide>(g[kMeanX]), dy = y - splat<kSide>(g[kMeanY]);
-  Offset<T, kSide> o;
-  o.u = splat<kSide>(g[kInvSigmaX]) * fnma(splat<kSide>(g[kSlope]), dy, dx);
-  o.v = splat<kSide>(g[kInvSigmaY]) * dy;
+template <class T>
+VLGS_INLINE Offset<T> offset(const T *g, const Pack<T> &x, const Pack<T> &y) {
+  const Pack<T> dx = x - splat(g[kMeanX]), dy = y - splat(g[kMeanY]);
+  Offset<T> o;
+  o.u = splat(g[kInvSigmaX]) * fnma(splat(g[kSlope]), dy, dx);
+  o.v = splat(g[kInvSigmaY]) * dy;
   o.exponent = fma(o.u, o.u, o.v * o.v);
   return o;
 }

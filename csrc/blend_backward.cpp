@@ -6,15 +6,6 @@
 namespace vlgs::VLGS_ISA_NS {
 namespace {
 
-// Blocks worked on side by side: as many as the registers hold.
-#if defined(__AVX512F__)
-template <class T>
-constexpr int kAbreast = sizeof(T) == 4 ? 2 : 1;
-#else
-template <class T>
-constexpr int kAbreast = 1;
-#endif
-
 // What is kept of a block, in packs.
 enum State { kCentreX, kCentreY, kChainState };
 enum ChainState {
@@ -113,109 +104,87 @@ struct Sums {
   Pack<T> moment[5], weight[kChains];
 };
 
-// Where kSide blocks begin in the arrays of a tile.
-template <int kSide>
-struct Places {
-  int64_t state[kSide], upstream[kSide];
-};
-template <int kSide, int kChains, class T>
-VLGS_INLINE Places<kSide> take_blocks(const Tile<T> &tile, uint32_t &blocks) {
-  Places<kSide> places;
-  for (int j = 0; j < kSide; ++j, blocks &= blocks - 1) {
-    const int64_t b = __builtin_ctz(blocks);
-    places.state[j] = b * state_size(kChains), places.upstream[j] = b * tile.upstream_stride;
-  }
-  return places;
-}
+// What a backward pass finds out. Where no shape and no weight needs a gradient, nothing needs what lies behind.
+enum class Need { kShape, kWeight, kValuesOnly };
 
-// Gradient by the weight and by the exponent in kSide blocks. toward[c] is the derivative of the loss by a T of
+// Gradient by the weight and by the exponent in one block. toward[c] is the derivative of the loss by a T of
 // chain c. Where a Gaussian is not reached its alpha is 0, which leaves every bit of the state. kClamp: whether
 // a weight is so large that alpha_max may bind.
-template <class T, int kChains, int kSide, bool kClamp>
-VLGS_INLINE void step(const Tile<T> &tile, const T *g, int64_t place, const Places<kSide> &places,
-                      const Pack<T, kSide> *toward, Sums<T, kChains> &sums, Pack<T, kSide> *weights) {
-  using P = Pack<T, kSide>;
-  const auto at = [&](int k) { return tile.state + k * kLanes; };
-  const Offset<T, kSide> o = offset(g, load<kSide>(at(kCentreX), places.state),
-                                    load<kSide>(at(kCentreY), places.state));
-  const P falloff = exp2_of_minus(o.exponent), zero = splat<kSide>(T(0)), one = splat<kSide>(T(1));
-  const P alpha_max = splat<kSide>(tile.alpha_max);
-  P h = zero;
+template <class T, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *toward,
+                      Sums<T, kChains> &sums, Pack<T> *weights) {
+  const Offset<T> o = offset(g, load(state + kCentreX * kLanes), load(state + kCentreY * kLanes));
+  const Pack<T> falloff = exp2_of_minus(o.exponent), zero = splat(T(0)), one = splat(T(1));
+  const Pack<T> alpha_max = splat(tile.alpha_max);
+  Pack<T> h = zero;
   for (int c = 0; c < kChains; ++c) {
+    weights[c] = zero;
+    if (!tile.pass->used[c]) continue;
     const T *chain = g + kChains0 + 2 * c;
-    const int from = kChainState + c * kChainStates;
-    const Mask<T, kSide> reached = (o.exponent <= splat<kSide>(chain[kCutoff])) &
-                                   (splat<kSide>(T(place)) <= load<kSide>(at(from + kLast), places.state));
-    const P raw = splat<kSide>(chain[kWeight]) * falloff;
-    const P alpha = select(reached, kClamp ? min(raw, alpha_max) : raw, zero);
-    const P t = load<kSide>(at(from + kTransmittance), places.state) * reciprocal(one - alpha);
-    store(at(from + kTransmittance), places.state, t);
+    T *mine = state + (kChainState + c * kChainStates) * kLanes;
+    const Mask<T> reached =
+        (o.exponent <= splat(chain[kCutoff])) & (splat(g[kPlace]) <= load(mine + kLast * kLanes));
+    const Pack<T> raw = splat(chain[kWeight]) * falloff;
+    const Pack<T> alpha = select(reached, kClamp ? min(raw, alpha_max) : raw, zero);
+    const Pack<T> t = load(mine + kTransmittance * kLanes) * reciprocal(one - alpha);
+    store(mine + kTransmittance * kLanes, t);
     weights[c] = alpha * t;
+    if constexpr (kNeed == Need::kValuesOnly) continue;
 
-    const P behind = load<kSide>(at(from + kBehind), places.state), ahead = toward[c] - behind;
-    store(at(from + kBehind), places.state, fma(alpha, ahead, behind));
-    P moved = weights[c] * ahead;
+    const Pack<T> behind = load(mine + kBehind * kLanes), ahead = toward[c] - behind;
+    store(mine + kBehind * kLanes, fma(alpha, ahead, behind));
+    Pack<T> moved = weights[c] * ahead;
     if constexpr (kClamp) moved = select(raw <= alpha_max, moved, zero);  // the clamp passes no gradient
-    sums.weight[c] = add_blocks(moved, sums.weight[c]);
-    if (tile.pass->shape_grad[c]) h = h + moved;
+    sums.weight[c] = sums.weight[c] + moved;
+    if (kNeed == Need::kShape && tile.pass->shape_grad[c]) h = h + moved;
   }
-  const P hu = h * o.u, hv = h * o.v;
-  sums.moment[kMomentU] = add_blocks(hu, sums.moment[kMomentU]);
-  sums.moment[kMomentV] = add_blocks(hv, sums.moment[kMomentV]);
-  sums.moment[kMomentUU] = fma_blocks(hu, o.u, sums.moment[kMomentUU]);
-  sums.moment[kMomentUV] = fma_blocks(hu, o.v, sums.moment[kMomentUV]);
-  sums.moment[kMomentVV] = fma_blocks(hv, o.v, sums.moment[kMomentVV]);
-}
-
-template <class T, int kChains, int kSide, bool kClamp>
-VLGS_INLINE void narrow_blocks(const Tile<T> &tile, const T *g, int64_t place, uint32_t &blocks,
-                               Sums<T, kChains> &sums, Pack<T> *d_values) {
-  using P = Pack<T, kSide>;
-  const Places<kSide> places = take_blocks<kSide, kChains>(tile, blocks);
-  P toward[kChains], weights[kChains], upstream[3 * kChains];
-  for (int c = 0; c < kChains; ++c) {
-    toward[c] = load<kSide>(tile.upstream + (4 * kChains + c) * kLanes, places.upstream);
-    for (int k = 0; k < 3; ++k) {
-      P &up = upstream[3 * c + k] = load<kSide>(tile.upstream + (4 * c + k) * kLanes, places.upstream);
-      toward[c] = fma(splat<kSide>(g[kValues + 3 * c + k]), up, toward[c]);
-    }
-  }
-  step<T, kChains, kSide, kClamp>(tile, g, place, places, toward, sums, weights);
-  for (int c = 0; c < kChains; ++c)
-    for (int k = 0; k < 3; ++k)
-      d_values[3 * c + k] = fma_blocks(weights[c], upstream[3 * c + k], d_values[3 * c + k]);
+  if constexpr (kNeed != Need::kShape) return;
+  const Pack<T> hu = h * o.u, hv = h * o.v;
+  sums.moment[kMomentU] = sums.moment[kMomentU] + hu;
+  sums.moment[kMomentV] = sums.moment[kMomentV] + hv;
+  sums.moment[kMomentUU] = fma(hu, o.u, sums.moment[kMomentUU]);
+  sums.moment[kMomentUV] = fma(hu, o.v, sums.moment[kMomentUV]);
+  sums.moment[kMomentVV] = fma(hv, o.v, sums.moment[kMomentVV]);
 }
 
 // Three channels per chain: their gradients are summed in registers too.
-template <class T, int kChains, bool kClamp>
-VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, int64_t place, uint32_t blocks, T *slot) {
-  const T *g = tile.records + place * kRecord;
+template <class T, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
+  const bool values = tile.pass->value_grads;
   Pack<T> all[kLanes];
   for (auto &a : all) a = splat(T(0));
   Sums<T, kChains> sums{};
   Pack<T> d_values[3 * kChains];
   for (auto &d : d_values) d = splat(T(0));
-  if constexpr (kAbreast<T> == 2)
-    while (blocks & (blocks - 1)) narrow_blocks<T, kChains, 2, kClamp>(tile, g, place, blocks, sums, d_values);
-  while (blocks) narrow_blocks<T, kChains, 1, kClamp>(tile, g, place, blocks, sums, d_values);
+  for (; blocks; blocks &= blocks - 1) {
+    const int64_t b = __builtin_ctz(blocks);
+    const T *upstream = tile.upstream + b * tile.upstream_stride;
+    Pack<T> toward[kChains], weights[kChains];
+    if constexpr (kNeed != Need::kValuesOnly)
+      for (int c = 0; c < kChains; ++c) {
+        toward[c] = load(upstream + (4 * kChains + c) * kLanes);
+        for (int k = 0; k < 3; ++k)
+          toward[c] = fma(splat(g[kValues + 3 * c + k]), load(upstream + (4 * c + k) * kLanes), toward[c]);
+      }
+    step<T, kChains, kNeed, kClamp>(tile, g, tile.state + b * state_size(kChains), toward, sums, weights);
+    if (values)
+      for (int c = 0; c < kChains; ++c)
+        for (int k = 0; k < 3; ++k)
+          d_values[3 * c + k] = fma(weights[c], load(upstream + (4 * c + k) * kLanes), d_values[3 * c + k]);
+  }
   for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
   for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
   for (int c = 0; c < 3 * kChains; ++c) all[kSlotValues + c] = d_values[c];
   sum_lanes(all, slot);
 }
 
-template <int kSide, class T>
-VLGS_INLINE Pack<T, kSide> project_values(const T *values, const T *upstream, const int64_t *places,
-                                          int64_t channels, Pack<T, kSide> start) {
-  Pack<T, kSide> acc[4] = {start};
-  for (int i = 1; i < 4; ++i) acc[i] = splat<kSide>(T(0));
-  const auto add = [&](Pack<T, kSide> &sum, int64_t k) {
-    sum = fma(splat<kSide>(values[k]), load<kSide>(upstream + k * kLanes, places), sum);
-  };
+template <class T>
+VLGS_INLINE Pack<T> project_values(const T *values, const T *upstream, int64_t channels, Pack<T> start) {
+  Pack<T> acc[4] = {start, splat(T(0)), splat(T(0)), splat(T(0))};
   int64_t k = 0;
   for (; k + 4 <= channels; k += 4)
-    for (int i = 0; i < 4; ++i) add(acc[i], k + i);
-  for (; k < channels; ++k) add(acc[0], k);
+    for (int i = 0; i < 4; ++i) acc[i] = fma(splat(values[k + i]), load(upstream + (k + i) * kLanes), acc[i]);
+  for (; k < channels; ++k) acc[0] = fma(splat(values[k]), load(upstream + k * kLanes), acc[0]);
   return (acc[0] + acc[2]) + (acc[1] + acc[3]);
 }
 
@@ -226,7 +195,7 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (auto &a : acc) a = splat(T(0));
   const T *weights = tile.state + (kChainState + chain * kChainStates + kAlphaT) * kLanes;
   for (; blocks; blocks &= blocks - 1) {
-    const int b = __builtin_ctz(blocks);
+    const int64_t b = __builtin_ctz(blocks);
     const Pack<T> weight = load(weights + b * state_size(kChains));
     const T *upstream = tile.upstream + b * tile.upstream_stride + offset * kLanes;
     for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, load(upstream + k * kLanes), acc[k]);
@@ -236,76 +205,68 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (int k = 0; k < kWidth; ++k) slot[k] = sums[k];
 }
 
-template <class T, int kChains, int kSide, bool kClamp>
-VLGS_INLINE void wide_blocks(const Tile<T> &tile, const T *g, int64_t place, uint32_t &blocks,
-                             Sums<T, kChains> &sums) {
+template <class T, int kChains, Need kNeed, bool kClamp>
+inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   const Pass<T> &p = *tile.pass;
-  const int64_t id = p.ids[p.ranks[tile.begin + place]];
-  const Places<kSide> places = take_blocks<kSide, kChains>(tile, blocks);
-  Pack<T, kSide> toward[kChains], weights[kChains];
-  for (int c = 0; c < kChains; ++c)
-    toward[c] = load<kSide>(tile.upstream + (p.padded_channels + c) * kLanes, places.upstream);
-  const T *upstream = tile.upstream;
-  for (int i = 0; i < p.num_parts; ++i) {
-    const Part<T> &part = p.parts[i];
-    toward[part.chain] = project_values<kSide>(part.values + id * part.channels, upstream, places.upstream,
-                                               part.channels, toward[part.chain]);
-    upstream += part.padded * kLanes;
-  }
-  step<T, kChains, kSide, kClamp>(tile, g, place, places, toward, sums, weights);
-  for (int c = 0; c < kChains; ++c)
-    store(tile.state + (kChainState + c * kChainStates + kAlphaT) * kLanes, places.state, weights[c]);
-}
-
-template <class T, int kChains, bool kClamp>
-inline void gaussian_wide(const Tile<T> &tile, int64_t place, uint32_t blocks, T *slot) {
-  const Pass<T> &p = *tile.pass;
-  const T *g = tile.records + place * kRecord;
+  const int64_t id = p.ids[p.ranks[tile.begin + int64_t(g[kPlace])]];
   Sums<T, kChains> sums{};
-  uint32_t rest = blocks;
-  if constexpr (kAbreast<T> == 2)
-    while (rest & (rest - 1)) wide_blocks<T, kChains, 2, kClamp>(tile, g, place, rest, sums);
-  while (rest) wide_blocks<T, kChains, 1, kClamp>(tile, g, place, rest, sums);
-  Pack<T> all[kLanes];
-  for (auto &a : all) a = splat(T(0));
-  for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
-  for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
-  T head[kLanes];
-  sum_lanes(all, head);
-  for (int i = 0; i < kSlotHead; ++i) slot[i] = head[i];
+  for (uint32_t rest = blocks; rest; rest &= rest - 1) {
+    const int64_t b = __builtin_ctz(rest);
+    const T *upstream = tile.upstream + b * tile.upstream_stride;
+    Pack<T> toward[kChains], weights[kChains];
+    if constexpr (kNeed != Need::kValuesOnly) {
+      for (int c = 0; c < kChains; ++c) toward[c] = load(upstream + (p.padded_channels + c) * kLanes);
+      for (int i = 0; i < p.num_parts; ++i) {
+        const Part<T> &part = p.parts[i];
+        if (part.d_image)
+          toward[part.chain] =
+              project_values(part.values + id * part.channels, upstream, part.channels, toward[part.chain]);
+        upstream += part.padded * kLanes;
+      }
+    }
+    T *state = tile.state + b * state_size(kChains);
+    step<T, kChains, kNeed, kClamp>(tile, g, state, toward, sums, weights);
+    for (int c = 0; c < kChains; ++c)
+      store(state + (kChainState + c * kChainStates + kAlphaT) * kLanes, weights[c]);
+  }
+  if constexpr (kNeed != Need::kValuesOnly) {
+    Pack<T> all[kLanes];
+    for (auto &a : all) a = splat(T(0));
+    for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
+    for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
+    T head[kLanes];
+    sum_lanes(all, head);
+    for (int i = 0; i < kSlotHead; ++i) slot[i] = head[i];
+  } else {
+    for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
+  }
 
   int64_t offset = 0;
   for (int i = 0; i < p.num_parts; ++i) {
     const Part<T> &part = p.parts[i];
     T *to = slot + part.slot;
     int64_t k = 0;
-    for (; k + 16 <= part.padded; k += 16)
-      value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
-    const int64_t left = part.padded - k;
-    if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
-    if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
-    if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
+    if (part.value_grad) {
+      for (; k + 16 <= part.padded; k += 16)
+        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
+      const int64_t left = part.padded - k;
+      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
+    }
     offset += part.padded;
   }
 }
 
-template <class T, int kChains, bool kClamp>
-VLGS_INLINE void gaussian(const Tile<T> &tile, int64_t place, uint32_t blocks, T *slot) {
+template <class T, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   if (tile.pass->narrow)
-    gaussian_narrow<T, kChains, kClamp>(tile, place, blocks, slot);
+    gaussian_narrow<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
   else
-    gaussian_wide<T, kChains, kClamp>(tile, place, blocks, slot);
+    gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
 }
 
-template <int kChains, class T>
-VLGS_INLINE bool may_clamp(const Tile<T> &tile, int64_t place) {
-  const T *chains = tile.records + place * kRecord + kChains0 + kWeight;
-  bool may = false;
-  for (int c = 0; c < kChains; ++c) may |= chains[2 * c] > tile.alpha_max;
-  return may;
-}
-
-template <class T, int kChains>
+template <class T, int kChains, Need kNeed>
 void blend_tile_backward(const Tile<T> &given, T *slots) {
   const Tile<T> tile = given;  // a copy that no store can reach stays in registers
   const Pass<T> &p = *tile.pass;
@@ -313,13 +274,27 @@ void blend_tile_backward(const Tile<T> &given, T *slots) {
   for (int64_t place = tile.count - 1; place >= 0; --place) {
     const uint32_t blocks = p.masks[tile.begin + place] & live.at(place);
     T *slot = slots + place * p.slot_size;
+    const T *g = tile.records + place * kRecord;
+    bool clamps = false;
+    for (int c = 0; c < kChains; ++c) clamps |= g[kChains0 + 2 * c + kWeight] > tile.alpha_max;
     if (!blocks)
       for (int64_t i = 0; i < p.slot_size; ++i) slot[i] = 0;
-    else if (may_clamp<kChains>(tile, place))
-      gaussian<T, kChains, true>(tile, place, blocks, slot);
+    else if (clamps)
+      gaussian<T, kChains, kNeed, true>(tile, g, blocks, slot);
     else
-      gaussian<T, kChains, false>(tile, place, blocks, slot);
+      gaussian<T, kChains, kNeed, false>(tile, g, blocks, slot);
   }
+}
+
+template <class T, int kChains>
+void blend_tile_backward(const Tile<T> &tile, T *slots) {
+  const Pass<T> &p = *tile.pass;
+  if (p.shape_grads)
+    blend_tile_backward<T, kChains, Need::kShape>(tile, slots);
+  else if (p.weight_grads)
+    blend_tile_backward<T, kChains, Need::kWeight>(tile, slots);
+  else
+    blend_tile_backward<T, kChains, Need::kValuesOnly>(tile, slots);
 }
 
 }  // namespace

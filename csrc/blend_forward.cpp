@@ -184,6 +184,7 @@ void blend_tile(const Tile<T> &tile) {
       Pack<T> t = rays.transmittance[c];
       if constexpr (kBefore) t = select(t <= splat(T(0)), splat(T(0)) - t, t);
       store(final + c * kLanes, t);
+      if (!p.transmittance) continue;
       store(p.transmittance + where + c * kBlocks * kLanes, t);
       store(p.last + where + c * kBlocks * kLanes, rays.last[c]);
     }

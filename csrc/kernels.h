@@ -83,6 +83,7 @@ struct Part {
   int64_t channels;
   int64_t padded;  // channels rounded up to 4, backward only
   int64_t slot;    // where its gradients begin in a slot, backward only
+  bool value_grad;  // whether they are wanted, backward only
   int chain;
   int group;  // for messages
 };
@@ -100,6 +101,9 @@ struct Pass {
   int64_t channels;  // of all parts
   int64_t padded_channels;
   bool shape_grad[kMaxChains];
+  // What backward is for; weights come with shapes. Slots hold nothing of what is not wanted.
+  bool shape_grads, weight_grads, value_grads;
+  bool used[kMaxChains];  // whether any picture of the chain has a gradient
 
   const uint32_t *ids;        // [m] row of each rank
   const T *records;           // [m, kRecord]
@@ -109,6 +113,7 @@ struct Pass {
 
   T *alphas[kMaxChains];          // [height, width] accumulated weight, forward only
   const T *d_alphas[kMaxChains];  // [height, width] or null, backward only
+  // Null where no backward pass will follow.
   T *transmittance;               // [tiles, chains, kBlocks, kPixels] after the last contribution
   T *last;                        // same shape: place in the tile's list of the last contribution, -1 without
   int64_t slot_size;              // numbers in a slot, backward only

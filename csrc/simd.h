@@ -1,6 +1,5 @@
-// Sixteen lanes of float or double: one 4x4 block of pixels; or as many blocks as are worked on side by side.
-// Everything lives in the namespace of one instruction set, so that the linker can never give code compiled for
-// one to another.
+// Sixteen lanes of float or double: one 4x4 block of pixels. Everything lives in the namespace of one
+// instruction set, so that the linker can never give code compiled for one to another.
 #pragma once
 
 #include <cstdint>
@@ -73,127 +72,107 @@ VLGS_INLINE V native_fnma(V a, V b, V c) {
 #endif
 }
 
-// kSide blocks of sixteen lanes. Two side by side hide the latency of each step behind that of the other.
-template <class T, int kSide = 1>
+template <class T>
 struct Pack {
   using Native = typename NativeOf<T>::Type;
   static constexpr int kWidth = kNativeBytes / sizeof(T);
-  static constexpr int kEach = kLanes / kWidth;
-  static constexpr int kParts = kSide * kEach;
+  static constexpr int kParts = kLanes / kWidth;
   Native part[kParts];
 };
 
 // A predicate per lane; all bits of a lane are equal.
-template <class T, int kSide = 1>
+template <class T>
 struct Mask {
   using Native = typename NativeOf<T>::Int;
-  Native part[Pack<T, kSide>::kParts];
+  Native part[Pack<T>::kParts];
 };
 
-#define VLGS_PACK template <class T, int kSide>
-#define VLGS_FOR_PARTS for (int i = 0; i < Pack<T, kSide>::kParts; ++i)
+#define VLGS_FOR_PARTS for (int i = 0; i < Pack<T>::kParts; ++i)
 
-template <int kSide = 1, class T>
-VLGS_INLINE Pack<T, kSide> splat(T x) {
-  Pack<T, kSide> r;
+template <class T>
+VLGS_INLINE Pack<T> splat(T x) {
+  Pack<T> r;
   VLGS_FOR_PARTS r.part[i] = x - typename Pack<T>::Native{};
   return r;
 }
 template <class T>
 VLGS_INLINE Pack<T> load(const T *from) {
   Pack<T> r;
-  for (int i = 0; i < Pack<T>::kParts; ++i)
-    std::memcpy(&r.part[i], from + i * Pack<T>::kWidth, kNativeBytes);
+  VLGS_FOR_PARTS std::memcpy(&r.part[i], from + i * Pack<T>::kWidth, kNativeBytes);
   return r;
 }
 template <class T>
 VLGS_INLINE void store(T *to, const Pack<T> &a) {
-  for (int i = 0; i < Pack<T>::kParts; ++i)
-    std::memcpy(to + i * Pack<T>::kWidth, &a.part[i], kNativeBytes);
+  VLGS_FOR_PARTS std::memcpy(to + i * Pack<T>::kWidth, &a.part[i], kNativeBytes);
 }
-// Block j from (to) places[j] on.
-template <int kSide, class T>
-VLGS_INLINE Pack<T, kSide> load(const T *from, const int64_t *places) {
-  Pack<T, kSide> r;
-  VLGS_FOR_PARTS std::memcpy(
-      &r.part[i], from + places[i / Pack<T>::kEach] + i % Pack<T>::kEach * Pack<T>::kWidth, kNativeBytes);
-  return r;
-}
-VLGS_PACK VLGS_INLINE void store(T *to, const int64_t *places, const Pack<T, kSide> &a) {
-  VLGS_FOR_PARTS std::memcpy(to + places[i / Pack<T>::kEach] + i % Pack<T>::kEach * Pack<T>::kWidth,
-                             &a.part[i], kNativeBytes);
-}
-VLGS_PACK VLGS_INLINE Pack<T> block(const Pack<T, kSide> &a, int j) {
-  Pack<T> r;
-  for (int i = 0; i < Pack<T>::kParts; ++i) r.part[i] = a.part[j * Pack<T>::kEach + i];
-  return r;
-}
-VLGS_PACK VLGS_INLINE Pack<T, kSide> operator+(Pack<T, kSide> a, const Pack<T, kSide> &b) {
+template <class T>
+VLGS_INLINE Pack<T> operator+(Pack<T> a, const Pack<T> &b) {
   VLGS_FOR_PARTS a.part[i] += b.part[i];
   return a;
 }
-VLGS_PACK VLGS_INLINE Pack<T, kSide> operator-(Pack<T, kSide> a, const Pack<T, kSide> &b) {
+template <class T>
+VLGS_INLINE Pack<T> operator-(Pack<T> a, const Pack<T> &b) {
   VLGS_FOR_PARTS a.part[i] -= b.part[i];
   return a;
 }
-VLGS_PACK VLGS_INLINE Pack<T, kSide> operator*(Pack<T, kSide> a, const Pack<T, kSide> &b) {
+template <class T>
+VLGS_INLINE Pack<T> operator*(Pack<T> a, const Pack<T> &b) {
   VLGS_FOR_PARTS a.part[i] *= b.part[i];
   return a;
 }
 // a * b + c
-VLGS_PACK VLGS_INLINE Pack<T, kSide> fma(const Pack<T, kSide> &a, const Pack<T, kSide> &b, Pack<T, kSide> c) {
+template <class T>
+VLGS_INLINE Pack<T> fma(const Pack<T> &a, const Pack<T> &b, Pack<T> c) {
   VLGS_FOR_PARTS c.part[i] = native_fma(a.part[i], b.part[i], c.part[i]);
   return c;
 }
 // c - a * b
-VLGS_PACK VLGS_INLINE Pack<T, kSide> fnma(const Pack<T, kSide> &a, const Pack<T, kSide> &b,
-                                          Pack<T, kSide> c) {
+template <class T>
+VLGS_INLINE Pack<T> fnma(const Pack<T> &a, const Pack<T> &b, Pack<T> c) {
   VLGS_FOR_PARTS c.part[i] = native_fnma(a.part[i], b.part[i], c.part[i]);
   return c;
 }
-// Sums over blocks, in their order.
-VLGS_PACK VLGS_INLINE Pack<T> add_blocks(const Pack<T, kSide> &a, Pack<T> sum) {
-  for (int j = 0; j < kSide; ++j) sum = sum + block(a, j);
-  return sum;
-}
-VLGS_PACK VLGS_INLINE Pack<T> fma_blocks(const Pack<T, kSide> &a, const Pack<T, kSide> &b, Pack<T> sum) {
-  for (int j = 0; j < kSide; ++j) sum = fma(block(a, j), block(b, j), sum);
-  return sum;
-}
-VLGS_PACK VLGS_INLINE Pack<T, kSide> min(Pack<T, kSide> a, const Pack<T, kSide> &b) {
+template <class T>
+VLGS_INLINE Pack<T> min(Pack<T> a, const Pack<T> &b) {
   VLGS_FOR_PARTS a.part[i] = a.part[i] < b.part[i] ? a.part[i] : b.part[i];
   return a;
 }
-VLGS_PACK VLGS_INLINE Mask<T, kSide> operator<=(const Pack<T, kSide> &a, const Pack<T, kSide> &b) {
-  Mask<T, kSide> r;
+template <class T>
+VLGS_INLINE Mask<T> operator<=(const Pack<T> &a, const Pack<T> &b) {
+  Mask<T> r;
   VLGS_FOR_PARTS r.part[i] = a.part[i] <= b.part[i];
   return r;
 }
-VLGS_PACK VLGS_INLINE Mask<T, kSide> operator<(const Pack<T, kSide> &a, const Pack<T, kSide> &b) {
-  Mask<T, kSide> r;
+template <class T>
+VLGS_INLINE Mask<T> operator<(const Pack<T> &a, const Pack<T> &b) {
+  Mask<T> r;
   VLGS_FOR_PARTS r.part[i] = a.part[i] < b.part[i];
   return r;
 }
-VLGS_PACK VLGS_INLINE Mask<T, kSide> operator|(Mask<T, kSide> a, const Mask<T, kSide> &b) {
-  VLGS_FOR_PARTS a.part[i] |= b.part[i];
-  return a;
-}
-VLGS_PACK VLGS_INLINE Mask<T, kSide> operator&(Mask<T, kSide> a, const Mask<T, kSide> &b) {
+template <class T>
+VLGS_INLINE Mask<T> operator&(Mask<T> a, const Mask<T> &b) {
   VLGS_FOR_PARTS a.part[i] &= b.part[i];
   return a;
 }
-VLGS_PACK VLGS_INLINE Mask<T, kSide> operator~(Mask<T, kSide> a) {
+template <class T>
+VLGS_INLINE Mask<T> operator|(Mask<T> a, const Mask<T> &b) {
+  VLGS_FOR_PARTS a.part[i] |= b.part[i];
+  return a;
+}
+template <class T>
+VLGS_INLINE Mask<T> operator~(Mask<T> a) {
   VLGS_FOR_PARTS a.part[i] = ~a.part[i];
   return a;
 }
-VLGS_PACK VLGS_INLINE Pack<T, kSide> select(const Mask<T, kSide> &m, Pack<T, kSide> a,
-                                            const Pack<T, kSide> &b) {
+template <class T>
+VLGS_INLINE Pack<T> select(const Mask<T> &m, Pack<T> a, const Pack<T> &b) {
   VLGS_FOR_PARTS a.part[i] = m.part[i] ? a.part[i] : b.part[i];
   return a;
 }
-VLGS_PACK VLGS_INLINE bool any(const Mask<T, kSide> &m) {
+template <class T>
+VLGS_INLINE bool any(const Mask<T> &m) {
   typename Mask<T>::Native all = m.part[0];
-  for (int i = 1; i < Pack<T, kSide>::kParts; ++i) all |= m.part[i];
+  for (int i = 1; i < Pack<T>::kParts; ++i) all |= m.part[i];
 #if defined(__AVX512F__)
   return _mm512_test_epi64_mask((__m512i)all, (__m512i)all) != 0;
 #elif defined(__AVX2__)
@@ -207,34 +186,33 @@ VLGS_PACK VLGS_INLINE bool any(const Mask<T, kSide> &m) {
 
 // 2^-x for 0 <= x <= 126, relative error below 1.7e-7 and exactly 1 at 0; other lanes come back as anything.
 #if !defined(__AVX512F__)
-template <int kSide>
-VLGS_INLINE Pack<float, kSide> exp2_of_minus(const Pack<float, kSide> &x) {
+VLGS_INLINE Pack<float> exp2_of_minus(const Pack<float> &x) {
   // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits; as an addend of the exponent it is
   // 2^n.
-  using P = Pack<float, kSide>;
-  const P magic = splat<kSide>(12582912.0f);
-  const P shifted = magic - x;
-  const P r = (magic - shifted) - x;  // in [-1/2, 1/2]
+  const Pack<float> magic = splat(12582912.0f);
+  const Pack<float> shifted = magic - x;
+  const Pack<float> r = (magic - shifted) - x;  // in [-1/2, 1/2]
   // Minimax of (2^r - 1) / r in relative error of 2^r, fitted by Lawson's iteration.
-  P p = fma(splat<kSide>(0x1.5bba14p-10f), r, splat<kSide>(0x1.3cea88p-7f));
-  p = fma(p, r, splat<kSide>(0x1.c6b752p-5f));
-  p = fma(p, r, splat<kSide>(0x1.ebf9bcp-3f));
-  p = fma(p, r, splat<kSide>(0x1.62e42ap-1f));
-  p = fma(p, r, splat<kSide>(1.0f));
+  Pack<float> p = fma(splat(0x1.5bba14p-10f), r, splat(0x1.3cea88p-7f));
+  p = fma(p, r, splat(0x1.c6b752p-5f));
+  p = fma(p, r, splat(0x1.ebf9bcp-3f));
+  p = fma(p, r, splat(0x1.62e42ap-1f));
+  p = fma(p, r, splat(1.0f));
   using Int = NativeOf<float>::Int;
-  for (int i = 0; i < P::kParts; ++i)
-    p.part[i] = (typename P::Native)((Int)p.part[i] + ((Int)shifted.part[i] << 23));
+  for (int i = 0; i < Pack<float>::kParts; ++i)
+    p.part[i] = (Pack<float>::Native)((Int)p.part[i] + ((Int)shifted.part[i] << 23));
   return p;
 }
 #endif
-template <int kSide>
-VLGS_INLINE Pack<double, kSide> exp2_of_minus(Pack<double, kSide> x) {
-  for (auto &part : x.part)
-    for (int l = 0; l < Pack<double>::kWidth; ++l) part[l] = __builtin_exp2(-part[l]);
-  return x;
+VLGS_INLINE Pack<double> exp2_of_minus(const Pack<double> &x) {
+  double lane[kLanes];
+  store(lane, x);
+  for (double &v : lane) v = __builtin_exp2(-v);
+  return load(lane);
 }
 
-VLGS_PACK VLGS_INLINE Pack<T, kSide> reciprocal(Pack<T, kSide> x) {
+template <class T>
+VLGS_INLINE Pack<T> reciprocal(Pack<T> x) {
   VLGS_FOR_PARTS x.part[i] = 1 / x.part[i];
   return x;
 }

@@ -4,78 +4,49 @@
 
 namespace vlgs::VLGS_ISA_NS {
 
-template <int kSide>
-struct Mask<float, kSide> {
-  __mmask16 bits[kSide];
+template <>
+struct Mask<float> {
+  __mmask16 bits;
 };
-
-#define VLGS_SIDE template <int kSide>
-#define VLGS_FOR_SIDE for (int i = 0; i < kSide; ++i)
-
-VLGS_SIDE VLGS_INLINE Mask<float, kSide> operator<=(const Pack<float, kSide> &a,
-                                                    const Pack<float, kSide> &b) {
-  Mask<float, kSide> r;
-  VLGS_FOR_SIDE r.bits[i] = _mm512_cmp_ps_mask((__m512)a.part[i], (__m512)b.part[i], _CMP_LE_OQ);
-  return r;
+VLGS_INLINE Mask<float> operator<=(const Pack<float> &a, const Pack<float> &b) {
+  return {_mm512_cmp_ps_mask((__m512)a.part[0], (__m512)b.part[0], _CMP_LE_OQ)};
 }
-VLGS_SIDE VLGS_INLINE Mask<float, kSide> operator<(const Pack<float, kSide> &a,
-                                                   const Pack<float, kSide> &b) {
-  Mask<float, kSide> r;
-  VLGS_FOR_SIDE r.bits[i] = _mm512_cmp_ps_mask((__m512)a.part[i], (__m512)b.part[i], _CMP_LT_OQ);
-  return r;
+VLGS_INLINE Mask<float> operator<(const Pack<float> &a, const Pack<float> &b) {
+  return {_mm512_cmp_ps_mask((__m512)a.part[0], (__m512)b.part[0], _CMP_LT_OQ)};
 }
-VLGS_SIDE VLGS_INLINE Mask<float, kSide> operator|(Mask<float, kSide> a, const Mask<float, kSide> &b) {
-  VLGS_FOR_SIDE a.bits[i] = _kor_mask16(a.bits[i], b.bits[i]);
-  return a;
+VLGS_INLINE Mask<float> operator&(Mask<float> a, const Mask<float> &b) {
+  return {(__mmask16)(a.bits & b.bits)};
 }
-VLGS_SIDE VLGS_INLINE Mask<float, kSide> operator&(Mask<float, kSide> a, const Mask<float, kSide> &b) {
-  VLGS_FOR_SIDE a.bits[i] = _kand_mask16(a.bits[i], b.bits[i]);
-  return a;
+VLGS_INLINE Mask<float> operator|(Mask<float> a, const Mask<float> &b) {
+  return {(__mmask16)(a.bits | b.bits)};
 }
-VLGS_SIDE VLGS_INLINE Mask<float, kSide> operator~(Mask<float, kSide> a) {
-  VLGS_FOR_SIDE a.bits[i] = _knot_mask16(a.bits[i]);
-  return a;
+VLGS_INLINE Mask<float> operator~(Mask<float> a) { return {(__mmask16)~a.bits}; }
+VLGS_INLINE bool any(const Mask<float> &m) { return m.bits != 0; }
+VLGS_INLINE Pack<float> select(const Mask<float> &m, Pack<float> a, const Pack<float> &b) {
+  return {{(Pack<float>::Native)_mm512_mask_blend_ps(m.bits, (__m512)b.part[0], (__m512)a.part[0])}};
 }
-VLGS_SIDE VLGS_INLINE bool any(const Mask<float, kSide> &m) {
-  uint32_t all = 0;
-  VLGS_FOR_SIDE all |= m.bits[i];
-  return all != 0;
-}
-VLGS_SIDE VLGS_INLINE Pack<float, kSide> select(const Mask<float, kSide> &m, Pack<float, kSide> a,
-                                                const Pack<float, kSide> &b) {
-  VLGS_FOR_SIDE a.part[i] =
-      (Pack<float>::Native)_mm512_mask_blend_ps(m.bits[i], (__m512)b.part[i], (__m512)a.part[i]);
-  return a;
-}
-VLGS_SIDE VLGS_INLINE Pack<float, kSide> min(Pack<float, kSide> a, const Pack<float, kSide> &b) {
-  VLGS_FOR_SIDE a.part[i] = (Pack<float>::Native)_mm512_min_ps((__m512)a.part[i], (__m512)b.part[i]);
-  return a;
+VLGS_INLINE Pack<float> min(Pack<float> a, const Pack<float> &b) {
+  return {{(Pack<float>::Native)_mm512_min_ps((__m512)a.part[0], (__m512)b.part[0])}};
 }
 
-VLGS_SIDE VLGS_INLINE Pack<float, kSide> exp2_of_minus(Pack<float, kSide> x) {
-  VLGS_FOR_SIDE {
-    const __m512 t = _mm512_sub_ps(_mm512_setzero_ps(), (__m512)x.part[i]);
-    const __m512 n = _mm512_roundscale_ps(t, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    const __m512 r = _mm512_sub_ps(t, n);
-    // The polynomial of simd.h.
-    __m512 p = _mm512_fmadd_ps(_mm512_set1_ps(0x1.5bba14p-10f), r, _mm512_set1_ps(0x1.3cea88p-7f));
-    p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(0x1.c6b752p-5f));
-    p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(0x1.ebf9bcp-3f));
-    p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(0x1.62e42ap-1f));
-    p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(1.0f));
-    x.part[i] = (Pack<float>::Native)_mm512_scalef_ps(p, n);
-  }
-  return x;
+VLGS_INLINE Pack<float> exp2_of_minus(const Pack<float> &x) {
+  const __m512 t = _mm512_sub_ps(_mm512_setzero_ps(), (__m512)x.part[0]);
+  const __m512 n = _mm512_roundscale_ps(t, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+  const __m512 r = _mm512_sub_ps(t, n);
+  // The polynomial of simd.h.
+  __m512 p = _mm512_fmadd_ps(_mm512_set1_ps(0x1.5bba14p-10f), r, _mm512_set1_ps(0x1.3cea88p-7f));
+  p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(0x1.c6b752p-5f));
+  p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(0x1.ebf9bcp-3f));
+  p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(0x1.62e42ap-1f));
+  p = _mm512_fmadd_ps(p, r, _mm512_set1_ps(1.0f));
+  return {{(Pack<float>::Native)_mm512_scalef_ps(p, n)}};
 }
 
 // Relative error below 2^-23: 14 bits of the estimate, doubled by one Newton step.
-VLGS_SIDE VLGS_INLINE Pack<float, kSide> reciprocal(Pack<float, kSide> x) {
-  VLGS_FOR_SIDE {
-    const __m512 d = (__m512)x.part[i];
-    const __m512 r = _mm512_rcp14_ps(d);
-    x.part[i] = (Pack<float>::Native)_mm512_fmadd_ps(r, _mm512_fnmadd_ps(d, r, _mm512_set1_ps(1.0f)), r);
-  }
-  return x;
+VLGS_INLINE Pack<float> reciprocal(Pack<float> x) {
+  const __m512 d = (__m512)x.part[0];
+  const __m512 r = _mm512_rcp14_ps(d);
+  return {{(Pack<float>::Native)_mm512_fmadd_ps(r, _mm512_fnmadd_ps(d, r, _mm512_set1_ps(1.0f)), r)}};
 }
 
 // Four levels of "interleave two, add" bring sixteen sums into the sixteen lanes of one register.
