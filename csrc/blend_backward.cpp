@@ -104,12 +104,13 @@ struct Sums {
   Pack<T> moment[5], weight[kChains];
 };
 
-// What a backward pass finds out. Where no shape and no weight needs a gradient, nothing needs what lies behind.
+// What a backward pass finds out. Where no shape and no weight needs a gradient, nothing needs what lies
+// behind.
 enum class Need { kShape, kWeight, kValuesOnly };
 
 // Gradient by the weight and by the exponent in one block. toward[c] is the derivative of the loss by a T of
-// chain c. Where a Gaussian is not reached its alpha is 0, which leaves every bit of the state. kClamp: whether
-// a weight is so large that alpha_max may bind.
+// chain c. Where a Gaussian is not reached its alpha is 0, which leaves every bit of the state. kClamp:
+// whether a weight is so large that alpha_max may bind.
 template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *toward,
                       Sums<T, kChains> &sums, Pack<T> *weights) {
@@ -301,8 +302,7 @@ void blend_tile_backward(const Tile<T> &tile, T *slots) {
 
 template <class T>
 int64_t backward_scratch(const Pass<T> &p, int64_t list_length) {
-  return list_length * kRecord +
-         kBlocks * ((p.padded_channels + p.chains) * kLanes + state_size(p.chains));
+  return list_length * kRecord + kBlocks * ((p.padded_channels + p.chains) * kLanes + state_size(p.chains));
 }
 
 template <class T>

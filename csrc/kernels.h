@@ -81,8 +81,8 @@ struct Part {
   const T *d_image;  // [height, width, channels], backward only; null where the image was not used
   T *image;          // [height, width, channels], forward only
   int64_t channels;
-  int64_t padded;  // channels rounded up to 4, backward only
-  int64_t slot;    // where its gradients begin in a slot, backward only
+  int64_t padded;   // channels rounded up to 4, backward only
+  int64_t slot;     // where its gradients begin in a slot, backward only
   bool value_grad;  // whether they are wanted, backward only
   int chain;
   int group;  // for messages
@@ -114,9 +114,9 @@ struct Pass {
   T *alphas[kMaxChains];          // [height, width] accumulated weight, forward only
   const T *d_alphas[kMaxChains];  // [height, width] or null, backward only
   // Null where no backward pass will follow.
-  T *transmittance;               // [tiles, chains, kBlocks, kPixels] after the last contribution
-  T *last;                        // same shape: place in the tile's list of the last contribution, -1 without
-  int64_t slot_size;              // numbers in a slot, backward only
+  T *transmittance;   // [tiles, chains, kBlocks, kPixels] after the last contribution
+  T *last;            // same shape: place in the tile's list of the last contribution, -1 without
+  int64_t slot_size;  // numbers in a slot, backward only
 };
 
 // A slot: gradients of one Gaussian from one tile. Moments are sums over pixels of h, the loss's derivative

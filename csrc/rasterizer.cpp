@@ -18,8 +18,8 @@ constexpr int64_t kSlotBytes = 8 << 20;
 
 constexpr int64_t kWideSlot = 64;  // numbers
 
-// Numbers of a slot that are summed by rank. Where there are hundreds of channels they are summed by row, where
-// they belong, because another copy of them all could be the largest array there is.
+// Numbers of a slot that are summed by rank. Where there are hundreds of channels they are summed by row,
+// where they belong, because another copy of them all could be the largest array there is.
 template <class T>
 int64_t summed(const Pass<T> &p) {
   return p.slot_size > kWideSlot ? kSlotHead : p.slot_size;
@@ -69,8 +69,7 @@ void refuse_upstream(const Pass<T> &p) {
 
 template <class T>
 Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vector<Chain<T>> chains,
-                std::vector<Part<T>> parts, const BlendConfig &config, bool keep, bool *visible,
-                int threads)
+                std::vector<Part<T>> parts, const BlendConfig &config, bool keep, bool *visible, int threads)
     : n_(n), grid_(grid), config_(config), chains_(std::move(chains)), parts_(std::move(parts)) {
   std::vector<const T *> weights;
   if (n >= kCulled)
@@ -230,8 +229,7 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads)
       for (int t = 0; t < threads; ++t) {
         const Range ranks = share(order_.count, t, threads);
         for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile)
-          add_slots(p, tile, ranks, slots.data() + (p.tile_begin[tile] - base) * size, sums.data(),
-                    d_values);
+          add_slots(p, tile, ranks, slots.data() + (p.tile_begin[tile] - base) * size, sums.data(), d_values);
       }
     }
   }
@@ -246,7 +244,8 @@ void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T>
   constexpr T kPerOctave = T(1 / kOctaves), kPerOctave2 = T(1 / (kOctaves * kOctaves));
   const int64_t size = summed(p);
   const bool by_row = size < p.slot_size;
-  T *const *d_weights = d.d_weights.data() + s.first_chain, *const *d_values = d.d_values.data() + s.first_part;
+  T *const *d_weights = d.d_weights.data() + s.first_chain, *const *d_values =
+                                                                d.d_values.data() + s.first_part;
   std::atomic<bool> bad = false;
 #pragma omp parallel for num_threads(threads)
   for (int64_t i = 0; i < n_; ++i) {

@@ -131,7 +131,7 @@ def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: _csrc.Camera)
     mean2d, ellipse = means.new_empty(len(means), 2), means.new_empty(len(means), 3)
     depth = means.new_empty(len(means))
     _csrc.project(
-        camera, means.detach().contiguous(), quats.detach().contiguous(), scales.detach().contiguous(),
+        camera, means.contiguous(), quats.contiguous(), scales.contiguous(),
         mean2d, ellipse, depth, torch.get_num_threads(),
     )  # fmt: skip
     return mean2d, ellipse, depth
@@ -162,7 +162,7 @@ class _Project(torch.autograd.Function):
 
 def _blend(layout: _Layout, keep: bool, *tensors: Tensor):
     """The kernel's object and the outputs of `_Blend`; nothing is kept for a backward pass unless asked for."""
-    mean2d, ellipse, depth, *rest = [t.detach().contiguous() for t in tensors]
+    mean2d, ellipse, depth, *rest = [t.contiguous() for t in tensors]
     num_chains = len(layout.shape_grads)
     weights, values = rest[:num_chains], rest[num_chains:]
     size = (layout.height, layout.width)
