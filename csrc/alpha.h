@@ -39,8 +39,10 @@ inline Centres<T> centres(const Grid &grid, int64_t tile, int b) {
 // Copies the records of a tile's list next to each other.
 template <class T>
 inline void gather_records(const Pass<T> &p, int64_t begin, int64_t end, T *to) {
-  for (int64_t k = begin; k < end; ++k, to += kRecord)
+  for (int64_t k = begin; k < end; ++k, to += kRecord) {
     store(to, load(p.records + int64_t(p.ranks[k]) * kRecord));
+    to[kPlace] = T(k - begin);
+  }
 }
 
 // Hands out pieces of one scratch array.

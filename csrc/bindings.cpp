@@ -102,7 +102,7 @@ void bind_blend(nb::module_ &m, const char *name) {
              const std::vector<bool> &shape_grads, const std::vector<Rows<const T>> &values,
              const std::vector<int> &groups, const std::vector<int> &chain_of, const BlendConfig &config,
              const std::vector<Image<T>> &images, const std::vector<Array<T, -1, -1>> &alphas,
-             Array<bool, -1> visible, int threads) {
+             Array<bool, -1> visible, bool keep, int threads) {
             std::vector<Chain<T>> chains;
             for (size_t c = 0; c < weights.size(); ++c) {
               const auto first = std::find(chain_of.begin(), chain_of.end(), int(c));
@@ -123,30 +123,32 @@ void bind_blend(nb::module_ &m, const char *name) {
                                    const_cast<T *>(depth.data())};
             nb::gil_scoped_release unlocked;
             new (self) Blend<T>(grid, int64_t(depth.shape(0)), splats, std::move(chains), std::move(parts),
-                                config, visible.data(), threads);
+                                config, keep, visible.data(), threads);
           },
           strict("mean2d"), strict("ellipse"), strict("depth"), strict("weights"), "shape_grads"_a,
           strict("values"), "groups"_a, "chain_of"_a, "config"_a, strict("images"), strict("alphas"),
-          strict("visible"), "threads"_a)
+          strict("visible"), "keep"_a, "threads"_a)
       .def(
           "backward",
           [](const Blend<T> &self, const std::vector<Rows<const T>> &values,
              const std::vector<std::optional<Image<const T>>> &d_images,
-             const std::vector<std::optional<Array<const T, -1, -1>>> &d_alphas, Array<T, -1, 2> d_mean2d,
-             Array<T, -1, 3> d_ellipse, const std::vector<Array<T, -1>> &d_weights,
-             const std::vector<Rows<T>> &d_values, int threads) {
+             const std::vector<std::optional<Array<const T, -1, -1>>> &d_alphas,
+             std::optional<Array<T, -1, 2>> d_mean2d, std::optional<Array<T, -1, 3>> d_ellipse,
+             const std::vector<std::optional<Array<T, -1>>> &d_weights,
+             const std::vector<std::optional<Rows<T>>> &d_values, int threads) {
             BlendGrads<T> d{};
             for (const auto &a : values) d.values.push_back(a.data());
             for (const auto &a : d_images) d.d_images.push_back(a ? a->data() : nullptr);
             for (const auto &a : d_alphas) d.d_alphas.push_back(a ? a->data() : nullptr);
-            d.d_mean2d = d_mean2d.data(), d.d_ellipse = d_ellipse.data();
-            for (const auto &a : d_weights) d.d_weights.push_back(a.data());
-            for (const auto &a : d_values) d.d_values.push_back(a.data());
+            d.d_mean2d = d_mean2d ? d_mean2d->data() : nullptr;
+            d.d_ellipse = d_ellipse ? d_ellipse->data() : nullptr;
+            for (const auto &a : d_weights) d.d_weights.push_back(a ? a->data() : nullptr);
+            for (const auto &a : d_values) d.d_values.push_back(a ? a->data() : nullptr);
             nb::gil_scoped_release unlocked;
             self.backward(d, threads);
           },
-          strict("values"), strict("d_images"), strict("d_alphas"), strict("d_mean2d"), strict("d_ellipse"),
-          strict("d_weights"), strict("d_values"), "threads"_a);
+          strict("values"), strict("d_images"), strict("d_alphas"), strict("d_mean2d").none(),
+          strict("d_ellipse").none(), strict("d_weights"), strict("d_values"), "threads"_a);
 }
 
 AttentionShape attention_shape(int64_t color, int64_t feature, int64_t heads, int64_t width, bool self) {

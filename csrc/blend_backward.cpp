@@ -6,7 +6,16 @@
 namespace vlgs::VLGS_ISA_NS {
 namespace {
 
-constexpr int64_t kStride = kBlocks * kLanes;
+// What is kept of a block, in packs.
+enum State { kCentreX, kCentreY, kChainState };
+enum ChainState {
+  kLast,           // place of the last contribution
+  kTransmittance,  // behind the Gaussian at hand
+  kBehind,         // what lies behind, as seen from the Gaussian at hand, in the direction of the gradient
+  kAlphaT,         // a T of the Gaussian at hand
+  kChainStates
+};
+constexpr int64_t state_size(int chains) { return (kChainState + chains * kChainStates) * kLanes; }
 
 template <class T>
 struct Tile {
@@ -14,13 +23,9 @@ struct Tile {
   int64_t index, begin, count;
   const T *records;
   T *upstream;  // [kBlocks, padded channels + chains, kLanes]: gradients of the images, then of the alphas
-  T *transmittance;  // [chains, kBlocks, kLanes] behind the Gaussian at hand
-  const T *last;     // same shape
-  T *behind;   // same shape: what lies behind, as seen from the Gaussian at hand, in the direction of the
-               // gradient
-  T *weights;  // same shape: a T of the Gaussian at hand
-  T *centres;  // [2, kBlocks, kLanes]
   int64_t upstream_stride;
+  T *state;  // [kBlocks, state_size]
+  T alpha_max;
 };
 
 // Blocks whose last contribution lies at or behind a place, updated while the place moves forward.
@@ -43,7 +48,8 @@ Live live_blocks(const Tile<T> &tile) {
     live.last[b] = -1;
     for (int c = 0; c < tile.pass->chains; ++c)
       for (int l = 0; l < kLanes; ++l) {
-        const T last = tile.last[c * kStride + b * kLanes + l];
+        const T last = tile.state[b * state_size(tile.pass->chains) +
+                                  (kChainState + c * kChainStates + kLast) * kLanes + l];
         if (last > T(live.last[b])) live.last[b] = int64_t(last);
       }
     int i = b;
@@ -98,33 +104,42 @@ struct Sums {
   Pack<T> moment[5], weight[kChains];
 };
 
+// What a backward pass finds out. Where no shape and no weight needs a gradient, nothing needs what lies
+// behind.
+enum class Need { kShape, kWeight, kValuesOnly };
+
 // Gradient by the weight and by the exponent in one block. toward[c] is the derivative of the loss by a T of
-// chain c.
-template <class T, int kChains>
-VLGS_INLINE void step(const Tile<T> &tile, const T *g, int64_t place, int b, const Pack<T> *toward,
+// chain c. Where a Gaussian is not reached its alpha is 0, which leaves every bit of the state. kClamp:
+// whether a weight is so large that alpha_max may bind.
+template <class T, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *toward,
                       Sums<T, kChains> &sums, Pack<T> *weights) {
-  const Pass<T> &p = *tile.pass;
-  const Offset<T> o = offset(g, load(tile.centres + b * kLanes), load(tile.centres + kStride + b * kLanes));
+  const Offset<T> o = offset(g, load(state + kCentreX * kLanes), load(state + kCentreY * kLanes));
   const Pack<T> falloff = exp2_of_minus(o.exponent), zero = splat(T(0)), one = splat(T(1));
+  const Pack<T> alpha_max = splat(tile.alpha_max);
   Pack<T> h = zero;
   for (int c = 0; c < kChains; ++c) {
+    weights[c] = zero;
+    if (!tile.pass->used[c]) continue;
     const T *chain = g + kChains0 + 2 * c;
-    const int64_t at = c * kStride + b * kLanes;
-    const Mask<T> reached = (o.exponent <= splat(chain[kCutoff])) & (splat(T(place)) <= load(tile.last + at));
+    T *mine = state + (kChainState + c * kChainStates) * kLanes;
+    const Mask<T> reached =
+        (o.exponent <= splat(chain[kCutoff])) & (splat(g[kPlace]) <= load(mine + kLast * kLanes));
     const Pack<T> raw = splat(chain[kWeight]) * falloff;
-    const Pack<T> alpha = select(reached, min(raw, splat(p.alpha_max)), zero);
-    Pack<T> t = load(tile.transmittance + at);
-    t = select(reached, t * reciprocal(one - alpha), t);
-    store(tile.transmittance + at, t);
+    const Pack<T> alpha = select(reached, kClamp ? min(raw, alpha_max) : raw, zero);
+    const Pack<T> t = load(mine + kTransmittance * kLanes) * reciprocal(one - alpha);
+    store(mine + kTransmittance * kLanes, t);
     weights[c] = alpha * t;
+    if constexpr (kNeed == Need::kValuesOnly) continue;
 
-    const Pack<T> behind = load(tile.behind + at), ahead = toward[c] - behind;
-    store(tile.behind + at, fma(alpha, ahead, behind));
-    const Mask<T> free = reached & (raw <= splat(p.alpha_max));  // the clamp passes no gradient
-    const Pack<T> d_weight = select(free, t * ahead * falloff, zero);
-    sums.weight[c] = sums.weight[c] + d_weight;
-    if (p.shape_grad[c]) h = fma(splat(chain[kWeight]), d_weight, h);
+    const Pack<T> behind = load(mine + kBehind * kLanes), ahead = toward[c] - behind;
+    store(mine + kBehind * kLanes, fma(alpha, ahead, behind));
+    Pack<T> moved = weights[c] * ahead;
+    if constexpr (kClamp) moved = select(raw <= alpha_max, moved, zero);  // the clamp passes no gradient
+    sums.weight[c] = sums.weight[c] + moved;
+    if (kNeed == Need::kShape && tile.pass->shape_grad[c]) h = h + moved;
   }
+  if constexpr (kNeed != Need::kShape) return;
   const Pack<T> hu = h * o.u, hv = h * o.v;
   sums.moment[kMomentU] = sums.moment[kMomentU] + hu;
   sums.moment[kMomentV] = sums.moment[kMomentV] + hv;
@@ -134,27 +149,29 @@ VLGS_INLINE void step(const Tile<T> &tile, const T *g, int64_t place, int b, con
 }
 
 // Three channels per chain: their gradients are summed in registers too.
-template <class T, int kChains>
-VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, int64_t place, uint32_t blocks, T *slot) {
-  const T *g = tile.records + place * kRecord;
+template <class T, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
+  const bool values = tile.pass->value_grads;
   Pack<T> all[kLanes];
   for (auto &a : all) a = splat(T(0));
   Sums<T, kChains> sums{};
   Pack<T> d_values[3 * kChains];
   for (auto &d : d_values) d = splat(T(0));
   for (; blocks; blocks &= blocks - 1) {
-    const int b = __builtin_ctz(blocks);
+    const int64_t b = __builtin_ctz(blocks);
     const T *upstream = tile.upstream + b * tile.upstream_stride;
     Pack<T> toward[kChains], weights[kChains];
-    for (int c = 0; c < kChains; ++c) {
-      toward[c] = load(upstream + (4 * kChains + c) * kLanes);
-      for (int k = 0; k < 3; ++k)
-        toward[c] = fma(splat(g[kValues + 3 * c + k]), load(upstream + (4 * c + k) * kLanes), toward[c]);
-    }
-    step<T, kChains>(tile, g, place, b, toward, sums, weights);
-    for (int c = 0; c < kChains; ++c)
-      for (int k = 0; k < 3; ++k)
-        d_values[3 * c + k] = fma(weights[c], load(upstream + (4 * c + k) * kLanes), d_values[3 * c + k]);
+    if constexpr (kNeed != Need::kValuesOnly)
+      for (int c = 0; c < kChains; ++c) {
+        toward[c] = load(upstream + (4 * kChains + c) * kLanes);
+        for (int k = 0; k < 3; ++k)
+          toward[c] = fma(splat(g[kValues + 3 * c + k]), load(upstream + (4 * c + k) * kLanes), toward[c]);
+      }
+    step<T, kChains, kNeed, kClamp>(tile, g, tile.state + b * state_size(kChains), toward, sums, weights);
+    if (values)
+      for (int c = 0; c < kChains; ++c)
+        for (int k = 0; k < 3; ++k)
+          d_values[3 * c + k] = fma(weights[c], load(upstream + (4 * c + k) * kLanes), d_values[3 * c + k]);
   }
   for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
   for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
@@ -173,13 +190,14 @@ VLGS_INLINE Pack<T> project_values(const T *values, const T *upstream, int64_t c
 }
 
 // Gradients of kWidth channels (a multiple of 4, at most 16), summed over the blocks.
-template <class T, int kWidth>
+template <class T, int kChains, int kWidth>
 VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks, int64_t offset, T *slot) {
   Pack<T> acc[kLanes];
   for (auto &a : acc) a = splat(T(0));
+  const T *weights = tile.state + (kChainState + chain * kChainStates + kAlphaT) * kLanes;
   for (; blocks; blocks &= blocks - 1) {
-    const int b = __builtin_ctz(blocks);
-    const Pack<T> weight = load(tile.weights + chain * kStride + b * kLanes);
+    const int64_t b = __builtin_ctz(blocks);
+    const Pack<T> weight = load(weights + b * state_size(kChains));
     const T *upstream = tile.upstream + b * tile.upstream_stride + offset * kLanes;
     for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, load(upstream + k * kLanes), acc[k]);
   }
@@ -188,96 +206,131 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (int k = 0; k < kWidth; ++k) slot[k] = sums[k];
 }
 
-template <class T, int kChains>
-inline void gaussian_wide(const Tile<T> &tile, int64_t place, uint32_t blocks, T *slot) {
+template <class T, int kChains, Need kNeed, bool kClamp>
+inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   const Pass<T> &p = *tile.pass;
-  const T *g = tile.records + place * kRecord;
-  const int64_t id = p.ids[p.ranks[tile.begin + place]];
+  const int64_t id = p.ids[p.ranks[tile.begin + int64_t(g[kPlace])]];
   Sums<T, kChains> sums{};
   for (uint32_t rest = blocks; rest; rest &= rest - 1) {
-    const int b = __builtin_ctz(rest);
+    const int64_t b = __builtin_ctz(rest);
     const T *upstream = tile.upstream + b * tile.upstream_stride;
     Pack<T> toward[kChains], weights[kChains];
-    for (int c = 0; c < kChains; ++c) toward[c] = load(upstream + (p.padded_channels + c) * kLanes);
-    for (int i = 0; i < p.num_parts; ++i) {
-      const Part<T> &part = p.parts[i];
-      toward[part.chain] =
-          project_values(part.values + id * part.channels, upstream, part.channels, toward[part.chain]);
-      upstream += part.padded * kLanes;
+    if constexpr (kNeed != Need::kValuesOnly) {
+      for (int c = 0; c < kChains; ++c) toward[c] = load(upstream + (p.padded_channels + c) * kLanes);
+      for (int i = 0; i < p.num_parts; ++i) {
+        const Part<T> &part = p.parts[i];
+        if (part.d_image)
+          toward[part.chain] =
+              project_values(part.values + id * part.channels, upstream, part.channels, toward[part.chain]);
+        upstream += part.padded * kLanes;
+      }
     }
-    step<T, kChains>(tile, g, place, b, toward, sums, weights);
-    for (int c = 0; c < kChains; ++c) store(tile.weights + c * kStride + b * kLanes, weights[c]);
+    T *state = tile.state + b * state_size(kChains);
+    step<T, kChains, kNeed, kClamp>(tile, g, state, toward, sums, weights);
+    for (int c = 0; c < kChains; ++c)
+      store(state + (kChainState + c * kChainStates + kAlphaT) * kLanes, weights[c]);
   }
-  Pack<T> all[kLanes];
-  for (auto &a : all) a = splat(T(0));
-  for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
-  for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
-  T head[kLanes];
-  sum_lanes(all, head);
-  for (int i = 0; i < kSlotHead; ++i) slot[i] = head[i];
+  if constexpr (kNeed != Need::kValuesOnly) {
+    Pack<T> all[kLanes];
+    for (auto &a : all) a = splat(T(0));
+    for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
+    for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
+    T head[kLanes];
+    sum_lanes(all, head);
+    for (int i = 0; i < kSlotHead; ++i) slot[i] = head[i];
+  } else {
+    for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
+  }
 
   int64_t offset = 0;
   for (int i = 0; i < p.num_parts; ++i) {
     const Part<T> &part = p.parts[i];
     T *to = slot + part.slot;
     int64_t k = 0;
-    for (; k + 16 <= part.padded; k += 16)
-      value_gradients<T, 16>(tile, part.chain, blocks, offset + k, to + k);
-    if (part.padded - k == 12) value_gradients<T, 12>(tile, part.chain, blocks, offset + k, to + k);
-    if (part.padded - k == 8) value_gradients<T, 8>(tile, part.chain, blocks, offset + k, to + k);
-    if (part.padded - k == 4) value_gradients<T, 4>(tile, part.chain, blocks, offset + k, to + k);
+    if (part.value_grad) {
+      for (; k + 16 <= part.padded; k += 16)
+        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
+      const int64_t left = part.padded - k;
+      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
+    }
     offset += part.padded;
+  }
+}
+
+template <class T, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
+  if (tile.pass->narrow)
+    gaussian_narrow<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+  else
+    gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+}
+
+template <class T, int kChains, Need kNeed>
+void blend_tile_backward(const Tile<T> &given, T *slots) {
+  const Tile<T> tile = given;  // a copy that no store can reach stays in registers
+  const Pass<T> &p = *tile.pass;
+  Live live = live_blocks(tile);
+  for (int64_t place = tile.count - 1; place >= 0; --place) {
+    const uint32_t blocks = p.masks[tile.begin + place] & live.at(place);
+    T *slot = slots + place * p.slot_size;
+    const T *g = tile.records + place * kRecord;
+    bool clamps = false;
+    for (int c = 0; c < kChains; ++c) clamps |= g[kChains0 + 2 * c + kWeight] > tile.alpha_max;
+    if (!blocks)
+      for (int64_t i = 0; i < p.slot_size; ++i) slot[i] = 0;
+    else if (clamps)
+      gaussian<T, kChains, kNeed, true>(tile, g, blocks, slot);
+    else
+      gaussian<T, kChains, kNeed, false>(tile, g, blocks, slot);
   }
 }
 
 template <class T, int kChains>
 void blend_tile_backward(const Tile<T> &tile, T *slots) {
   const Pass<T> &p = *tile.pass;
-  Live live = live_blocks(tile);
-  for (int64_t place = tile.count - 1; place >= 0; --place) {
-    const uint32_t blocks = p.masks[tile.begin + place] & live.at(place);
-    T *slot = slots + place * p.slot_size;
-    if (!blocks)
-      for (int64_t i = 0; i < p.slot_size; ++i) slot[i] = 0;
-    else if (p.narrow)
-      gaussian_narrow<T, kChains>(tile, place, blocks, slot);
-    else
-      gaussian_wide<T, kChains>(tile, place, blocks, slot);
-  }
+  if (p.shape_grads)
+    blend_tile_backward<T, kChains, Need::kShape>(tile, slots);
+  else if (p.weight_grads)
+    blend_tile_backward<T, kChains, Need::kWeight>(tile, slots);
+  else
+    blend_tile_backward<T, kChains, Need::kValuesOnly>(tile, slots);
 }
 
 }  // namespace
 
 template <class T>
 int64_t backward_scratch(const Pass<T> &p, int64_t list_length) {
-  return list_length * kRecord + (p.padded_channels + p.chains) * kStride + (3 * p.chains + 2) * kStride;
+  return list_length * kRecord + kBlocks * ((p.padded_channels + p.chains) * kLanes + state_size(p.chains));
 }
 
 template <class T>
 bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
-  const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin,
-                state = p.chains * kStride;
+  const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin;
   Carver<T> carver{scratch};
   Tile<T> tile{};
-  tile.pass = &p;
+  tile.pass = &p, tile.alpha_max = p.alpha_max;
   tile.index = index, tile.begin = begin, tile.count = count;
   T *records = carver.take(count * kRecord);
   tile.records = records;
   tile.upstream_stride = (p.padded_channels + p.chains) * kLanes;
   tile.upstream = carver.take(kBlocks * tile.upstream_stride);
-  tile.transmittance = carver.take(state);
-  tile.behind = carver.take(state);
-  tile.weights = carver.take(state);
-  tile.centres = carver.take(2 * kStride);
-  tile.last = p.last + index * state;
+  tile.state = carver.take(kBlocks * state_size(p.chains));
   if (!load_upstream(tile)) return false;
   gather_records(p, begin, begin + count, records);
-  for (int64_t i = 0; i < state; ++i)
-    tile.transmittance[i] = p.transmittance[index * state + i], tile.behind[i] = 0;
   for (int b = 0; b < kBlocks; ++b) {
+    T *state = tile.state + b * state_size(p.chains);
     const Centres<T> at = centres<T>(p.grid, index, b);
-    store(tile.centres + b * kLanes, at.x);
-    store(tile.centres + kStride + b * kLanes, at.y);
+    store(state + kCentreX * kLanes, at.x);
+    store(state + kCentreY * kLanes, at.y);
+    for (int c = 0; c < p.chains; ++c) {
+      const int64_t from = ((index * p.chains + c) * kBlocks + b) * kLanes;
+      T *chain = state + (kChainState + c * kChainStates) * kLanes;
+      store(chain + kLast * kLanes, load(p.last + from));
+      store(chain + kTransmittance * kLanes, load(p.transmittance + from));
+      store(chain + kBehind * kLanes, splat(T(0)));
+    }
   }
   p.chains == 1 ? blend_tile_backward<T, 1>(tile, slots) : blend_tile_backward<T, 2>(tile, slots);
   return true;

@@ -23,33 +23,33 @@ struct Rays {
 
 // The weights a_i T_i of one Gaussian in all chains; false once every pixel is done in every chain.
 template <class T, int kChains, bool kBefore>
-VLGS_INLINE bool weigh(const Pass<T> &p, const T *g, const Centres<T> &at, uint32_t place,
-                       Rays<T, kChains> &rays, Pack<T> *weights) {
+VLGS_INLINE bool weigh(const Pass<T> &p, const T *g, const Centres<T> &at, Rays<T, kChains> &rays,
+                       Pack<T> *weights) {
   const Pack<T> floor = splat(kBefore ? T(0) : p.transmittance_min);
-  Mask<T> done[kChains];
-  for (int c = 0; c < kChains; ++c) done[c] = rays.transmittance[c] <= floor;
-  Mask<T> all_done = done[0];
-  for (int c = 1; c < kChains; ++c) all_done = all_done & done[c];
-  if (!any(~all_done)) return false;
+  Mask<T> going[kChains];
+  for (int c = 0; c < kChains; ++c) going[c] = floor < rays.transmittance[c];
+  Mask<T> some_going = going[0];
+  for (int c = 1; c < kChains; ++c) some_going = some_going | going[c];
+  if (!any(some_going)) return false;
 
   const Offset<T> o = offset(g, at.x, at.y);
   const Pack<T> falloff = exp2_of_minus(o.exponent);
   const Pack<T> zero = splat(T(0));
   for (int c = 0; c < kChains; ++c) {
     const T *chain = g + kChains0 + 2 * c;
-    Mask<T> reached = (o.exponent <= splat(chain[kCutoff])) & ~done[c];
-    const Pack<T> alpha = min(splat(chain[kWeight]) * falloff, splat(p.alpha_max));
+    Mask<T> reached = going[c] & (o.exponent <= splat(chain[kCutoff]));
+    // An alpha of 0 leaves every bit of the transmittance.
+    Pack<T> alpha = select(reached, min(splat(chain[kWeight]) * falloff, splat(p.alpha_max)), zero);
     Pack<T> &t = rays.transmittance[c];
-    Pack<T> weight = alpha * t;
-    const Pack<T> after = fnma(alpha, t, t);
     if constexpr (kBefore) {
-      const Mask<T> crosses = reached & (after <= splat(p.transmittance_min));
+      const Mask<T> crosses = reached & (fnma(alpha, t, t) <= splat(p.transmittance_min));
       reached = reached & ~crosses;
+      alpha = select(crosses, zero, alpha);
       t = select(crosses, zero - t, t);
     }
-    t = select(reached, after, t);
-    rays.last[c] = select(reached, splat(T(place)), rays.last[c]);
-    weights[c] = select(reached, weight, zero);
+    rays.last[c] = select(reached, splat(g[kPlace]), rays.last[c]);
+    weights[c] = alpha * t;
+    t = fnma(alpha, t, t);
   }
   return true;
 }
@@ -74,7 +74,7 @@ inline void sum_narrow(const Tile<T> &tile, const Centres<T> &at, int64_t reach,
   for (int64_t j = 0; j < reach; ++j) {
     const T *g = tile.records + int64_t(tile.list[j]) * kRecord;
     Pack<T> weights[kChains];
-    if (!weigh<T, kChains, kBefore>(*tile.pass, g, at, tile.list[j], rays, weights)) break;
+    if (!weigh<T, kChains, kBefore>(*tile.pass, g, at, rays, weights)) break;
     for (int c = 0; c < kChains; ++c)
       for (int k = 0; k < 3; ++k)
         sums[3 * c + k] = fma(weights[c], splat(g[kValues + 3 * c + k]), sums[3 * c + k]);
@@ -108,8 +108,7 @@ inline void sum_wide(const Tile<T> &tile, const Centres<T> &at, int64_t reach, R
     for (; count < kWeightsAhead && first + count < reach; ++count) {
       const uint32_t place = tile.list[first + count];
       Pack<T> weights[kChains];
-      going =
-          weigh<T, kChains, kBefore>(p, tile.records + int64_t(place) * kRecord, at, place, rays, weights);
+      going = weigh<T, kChains, kBefore>(p, tile.records + int64_t(place) * kRecord, at, rays, weights);
       if (!going) break;
       for (int c = 0; c < kChains; ++c)
         store(tile.weights + (c * kWeightsAhead + count) * kLanes, weights[c]);
@@ -148,15 +147,30 @@ void write_block(const Tile<T> &tile, int b, const T *transmittance) {
   }
 }
 
+// Places of the masks that have bit b; writes up to kListSlack entries more than it returns.
+inline int64_t list_block(const uint16_t *masks, int64_t count, int b, uint32_t *list) {
+  int64_t reach = 0, k = 0;
+#if defined(__AVX512F__)
+  const __m256i bit = _mm256_set1_epi16(int16_t(1 << b));
+  __m512i places = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  for (; k + 16 <= count; k += 16, places = _mm512_add_epi32(places, _mm512_set1_epi32(16))) {
+    const __mmask16 has = _mm256_test_epi16_mask(_mm256_loadu_si256((const __m256i *)(masks + k)), bit);
+    _mm512_storeu_si512(list + reach, _mm512_maskz_compress_epi32(has, places));
+    reach += __builtin_popcount(has);
+  }
+#endif
+  for (; k < count; ++k) {
+    list[reach] = uint32_t(k);
+    reach += (masks[k] >> b) & 1;
+  }
+  return reach;
+}
+
 template <class T, int kChains, bool kBefore>
 void blend_tile(const Tile<T> &tile) {
   const Pass<T> &p = *tile.pass;
   for (int b = 0; b < kBlocks; ++b) {
-    int64_t reach = 0;
-    for (int64_t k = 0; k < tile.count; ++k) {
-      tile.list[reach] = uint32_t(k);
-      reach += (p.masks[tile.begin + k] >> b) & 1;
-    }
+    const int64_t reach = list_block(p.masks + tile.begin, tile.count, b, tile.list);
     const Centres<T> at = centres<T>(p.grid, tile.index, b);
     Rays<T, kChains> rays = start_rays<T, kChains>(p, at);
     if (p.narrow)
@@ -170,6 +184,7 @@ void blend_tile(const Tile<T> &tile) {
       Pack<T> t = rays.transmittance[c];
       if constexpr (kBefore) t = select(t <= splat(T(0)), splat(T(0)) - t, t);
       store(final + c * kLanes, t);
+      if (!p.transmittance) continue;
       store(p.transmittance + where + c * kBlocks * kLanes, t);
       store(p.last + where + c * kBlocks * kLanes, rays.last[c]);
     }

@@ -20,6 +20,7 @@ constexpr int kPixels = 16;        // pixels of a block, row by row
 constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
 constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
 constexpr int kFrozenAhead = 16;   // entries between asking for a kept weight and using it
+constexpr int kListSlack = 16;     // entries that a block's list may be written beyond its end
 constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
 
 // Exponents are in octaves: weight falls off as 2^-(u^2 + v^2) with u, v scaled by kOctaves = sqrt(log2(e) /
@@ -65,7 +66,16 @@ struct Box {
 };
 
 // A record: what the tile kernels read of a visible Gaussian, one cache line of floats.
-enum Record { kMeanX, kMeanY, kInvSigmaX, kSlope, kInvSigmaY, kChains0, kValues = kChains0 + 2 * kMaxChains };
+enum Record {
+  kMeanX,
+  kMeanY,
+  kInvSigmaX,
+  kSlope,
+  kInvSigmaY,
+  kChains0,
+  kValues = kChains0 + 2 * kMaxChains,
+  kPlace = kRecord - 1  // in the list of the tile at hand
+};
 constexpr int kWeight = 0, kCutoff = 1;  // record[kChains0 + 2 chain + ...]
 
 // One group of channels; several may hang on one chain.
@@ -75,8 +85,9 @@ struct Part {
   const T *d_image;  // [height, width, channels], backward only; null where the image was not used
   T *image;          // [height, width, channels], forward only
   int64_t channels;
-  int64_t padded;  // channels rounded up to 4, backward only
-  int64_t slot;    // where its gradients begin in a slot, backward only
+  int64_t padded;   // channels rounded up to 4, backward only
+  int64_t slot;     // where its gradients begin in a slot, backward only
+  bool value_grad;  // whether they are wanted, backward only
   int chain;
   int group;  // for messages
 };
@@ -94,6 +105,9 @@ struct Pass {
   int64_t channels;  // of all parts
   int64_t padded_channels;
   bool shape_grad[kMaxChains];
+  // What backward is for; weights come with shapes. Slots hold nothing of what is not wanted.
+  bool shape_grads, weight_grads, value_grads;
+  bool used[kMaxChains];  // whether any picture of the chain has a gradient
 
   const uint32_t *ids;        // [m] row of each rank
   const T *records;           // [m, kRecord]
@@ -103,13 +117,15 @@ struct Pass {
 
   T *alphas[kMaxChains];          // [height, width] accumulated weight, forward only
   const T *d_alphas[kMaxChains];  // [height, width] or null, backward only
-  T *transmittance;               // [tiles, chains, kBlocks, kPixels] after the last contribution
-  T *last;                        // same shape: place in the tile's list of the last contribution, -1 without
-  int64_t slot_size;              // numbers in a slot, backward only
+  // Null where no backward pass will follow.
+  T *transmittance;   // [tiles, chains, kBlocks, kPixels] after the last contribution
+  T *last;            // same shape: place in the tile's list of the last contribution, -1 without
+  int64_t slot_size;  // numbers in a slot, backward only
 };
 
 // A slot: gradients of one Gaussian from one tile. Moments are sums over pixels of h, the loss's derivative
-// by the negative exponent, times u, v, u^2, u v, v^2 (README.md). The channels of the parts follow.
+// by the negative exponent, times u, v, u^2, u v, v^2; a chain's own part of the sum of h is weight times the
+// gradient of the weight (README.md). The channels of the parts follow.
 enum Slot {
   kMomentU,
   kMomentV,

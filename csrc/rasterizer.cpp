@@ -16,17 +16,40 @@ constexpr int64_t kAhead = 16;  // rows between asking for a cache line out of o
 // Slots are summed whenever this much has been written: small enough to be in cache still.
 constexpr int64_t kSlotBytes = 8 << 20;
 
+constexpr int64_t kWideSlot = 64;  // numbers
+
+// Numbers of a slot that are summed by rank. Where there are hundreds of channels they are summed by row,
+// where they belong, because another copy of them all could be the largest array there is.
+template <class T>
+int64_t summed(const Pass<T> &p) {
+  return p.slot_size > kWideSlot ? kSlotHead : p.slot_size;
+}
+
 // Adds the slots of one tile to the sums of the ranks in a range, of which the tile's list holds one stretch.
 template <class T>
-void add_slots(const Pass<T> &p, int64_t tile, Range ranks, const T *slots, T *sums) {
+void add_slots(const Pass<T> &p, int64_t tile, Range ranks, const T *slots, T *sums, T *const *d_values) {
   const uint32_t *list = p.ranks + p.tile_begin[tile], *end = p.ranks + p.tile_begin[tile + 1];
   const uint32_t *at = std::lower_bound(list, end, ranks.begin);
+  const int64_t size = summed(p);
   for (; at < end && *at < ranks.end; ++at) {
-    if (at + kAhead < end) __builtin_prefetch(sums + at[kAhead] * p.slot_size, 1);
-    T *sum = sums + *at * p.slot_size;
+    if (at + kAhead < end) __builtin_prefetch(sums + at[kAhead] * size, 1);
+    T *sum = sums + *at * size;
     const T *slot = slots + (at - list) * p.slot_size;
-    for (int64_t i = 0; i < p.slot_size; ++i) sum[i] += slot[i];
+    for (int64_t i = 0; i < size; ++i) sum[i] += slot[i];
+    if (size == p.slot_size) continue;
+    for (int k = 0; k < p.num_parts; ++k) {
+      const Part<T> &part = p.parts[k];
+      if (!part.value_grad) continue;
+      T *row = d_values[k] + int64_t(p.ids[*at]) * part.channels;
+      for (int64_t i = 0; i < part.channels; ++i) row[i] += slot[part.slot + i];
+    }
   }
+}
+
+// Entries whose slots are held at once, if a tile alone does not hold more.
+template <class T>
+int64_t entries_at_once(const Pass<T> &p) {
+  return std::max<int64_t>(1, kSlotBytes / (p.slot_size * int64_t(sizeof(T))));
 }
 
 // Throws for what the tile kernels found.
@@ -46,7 +69,7 @@ void refuse_upstream(const Pass<T> &p) {
 
 template <class T>
 Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vector<Chain<T>> chains,
-                std::vector<Part<T>> parts, const BlendConfig &config, bool *visible, int threads)
+                std::vector<Part<T>> parts, const BlendConfig &config, bool keep, bool *visible, int threads)
     : n_(n), grid_(grid), config_(config), chains_(std::move(chains)), parts_(std::move(parts)) {
   std::vector<const T *> weights;
   if (n >= kCulled)
@@ -65,7 +88,10 @@ Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vecto
   }
   lists_ = make_lists(grid, n, order_, stages_[0].records.data(), num_chains, T(config.alpha_min),
                       config.trim, config.memory_budget, visible, row_threads);
-  for (Stage &s : stages_) render(s, worth(lists_.begin.back() + grid.tiles_x * grid.tiles_y, threads));
+  for (Stage &s : stages_) {
+    if (keep) check_memory(s.pass);
+    render(s, keep, worth(lists_.begin.back() + grid.tiles_x * grid.tiles_y, threads));
+  }
 }
 
 template <class T>
@@ -137,16 +163,28 @@ void Blend<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) cons
                part.channels, -kLargest, kLargest);
 }
 
+// Slots and their sums count towards the budget where gradients may be asked for.
 template <class T>
-void Blend<T>::render(Stage &s, int threads) const {
+void Blend<T>::check_memory(const Pass<T> &p) const {
+  const int64_t entries = lists_.begin.back();
+  const int64_t slots = std::min(entries, std::max(entries_at_once(p), lists_.longest));
+  const int64_t bytes = entries * int64_t(sizeof(uint32_t) + sizeof(uint16_t)) +
+                        (slots * p.slot_size + order_.count * summed(p)) * int64_t(sizeof(T));
+  if (bytes > config_.memory_budget)
+    throw std::invalid_argument("rasterize: tile lists and gradients must be within memory_budget = " +
+                                std::to_string(config_.memory_budget) + " bytes, got " +
+                                std::to_string(bytes));
+}
+
+template <class T>
+void Blend<T>::render(Stage &s, bool keep, int threads) const {
   Pass<T> &p = s.pass;
   p.tile_begin = lists_.begin.data(), p.ranks = lists_.ranks.data(), p.masks = lists_.masks.data();
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y, pixels = tiles * p.chains * kBlocks * kPixels;
-  s.transmittance = Buffer<T>(pixels);
-  s.last = Buffer<T>(pixels);
+  if (keep) s.transmittance = Buffer<T>(pixels), s.last = Buffer<T>(pixels);
   p.transmittance = s.transmittance.data(), p.last = s.last.data();
   const Kernels<T> &kernel = kernels<T>();
-  const int64_t size = kernel.blend_scratch(p, lists_.longest), list_size = lists_.longest + 1;
+  const int64_t size = kernel.blend_scratch(p, lists_.longest), list_size = lists_.longest + kListSlack;
   const Buffer<T> scratch(threads * size);
   const Buffer<uint32_t> list(threads * list_size);
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
@@ -156,15 +194,16 @@ void Blend<T>::render(Stage &s, int threads) const {
   }
 }
 
-// Sum of the slots of every rank, in the order of the tiles whatever the threads: [m, slot_size].
+// Sum of the slots of every rank, in the order of the tiles whatever the threads: [m, summed]. Wide channels
+// are added to d_values.
 template <class T>
-Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, int threads) const {
-  const int64_t tiles = p.grid.tiles_x * p.grid.tiles_y, m = order_.count, size = p.slot_size;
-  const int64_t entries_at_once = std::max<int64_t>(1, kSlotBytes / (size * int64_t(sizeof(T))));
+Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads) const {
+  const int64_t tiles = p.grid.tiles_x * p.grid.tiles_y, size = p.slot_size;
+  const int64_t num_sums = order_.count * summed(p), at_once = entries_at_once(p);
   std::vector<int64_t> strips = {0};  // first tile of each
   int64_t most = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
-    if (p.tile_begin[tile + 1] - p.tile_begin[strips.back()] > entries_at_once && tile > strips.back())
+    if (p.tile_begin[tile + 1] - p.tile_begin[strips.back()] > at_once && tile > strips.back())
       strips.push_back(tile);
     most = std::max(most, p.tile_begin[tile + 1] - p.tile_begin[strips.back()]);
   }
@@ -172,12 +211,12 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, int threads) const {
 
   const Kernels<T> &kernel = kernels<T>();
   const int64_t scratch_size = kernel.backward_scratch(p, lists_.longest);
-  Buffer<T> sums(m * size), slots(most * size), scratch(threads * scratch_size);
+  Buffer<T> sums(num_sums), slots(most * size), scratch(threads * scratch_size);
   std::atomic<bool> bad = false;
 #pragma omp parallel num_threads(threads)
   {
 #pragma omp for schedule(static)
-    for (int64_t i = 0; i < m * size; ++i) sums[i] = 0;
+    for (int64_t i = 0; i < num_sums; ++i) sums[i] = 0;
     for (size_t s = 0; s + 1 < strips.size(); ++s) {
       const int64_t base = p.tile_begin[strips[s]];
 #pragma omp for schedule(dynamic)
@@ -188,9 +227,9 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, int threads) const {
       }
 #pragma omp for schedule(static, 1)
       for (int t = 0; t < threads; ++t) {
-        const Range ranks = share(m, t, threads);
+        const Range ranks = share(order_.count, t, threads);
         for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile)
-          add_slots(p, tile, ranks, slots.data() + (p.tile_begin[tile] - base) * size, sums.data());
+          add_slots(p, tile, ranks, slots.data() + (p.tile_begin[tile] - base) * size, sums.data(), d_values);
       }
     }
   }
@@ -200,47 +239,61 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, int threads) const {
 
 // From moments to gradients (README.md), and from ranks to rows.
 template <class T>
-void Blend<T>::write_gradients(const Stage &s, const Buffer<T> &sums, const BlendGrads<T> &d,
-                               int threads) const {
-  const Pass<T> &p = s.pass;
+void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T> &sums,
+                               const BlendGrads<T> &d, int threads) const {
   constexpr T kPerOctave = T(1 / kOctaves), kPerOctave2 = T(1 / (kOctaves * kOctaves));
-  const bool first = s.first_chain == 0;
+  const int64_t size = summed(p);
+  const bool by_row = size < p.slot_size;
+  T *const *d_weights = d.d_weights.data() + s.first_chain, *const *d_values =
+                                                                d.d_values.data() + s.first_part;
   std::atomic<bool> bad = false;
 #pragma omp parallel for num_threads(threads)
   for (int64_t i = 0; i < n_; ++i) {
     static constexpr T kNothing[kRecord] = {};
     const bool seen = order_.rank_of[i] != kCulled;
     if (const uint32_t next = order_.rank_of[std::min(i + kAhead, n_ - 1)]; next != kCulled) {
-      __builtin_prefetch(sums.data() + next * p.slot_size);
+      __builtin_prefetch(sums.data() + next * size);
       __builtin_prefetch(p.records + next * int64_t(kRecord));
     }
-    T *d_mean = d.d_mean2d + 2 * i, *d_ellipse = d.d_ellipse + 3 * i;
-    if (first) std::fill(d_mean, d_mean + 2, T(0)), std::fill(d_ellipse, d_ellipse + 3, T(0));
-    const T *sum = seen ? sums.data() + order_.rank_of[i] * p.slot_size : kNothing;
-    for (int c = 0; c < p.chains; ++c) d.d_weights[s.first_chain + c][i] = sum[kSlotWeight0 + c];
+    const T *sum = seen ? sums.data() + order_.rank_of[i] * size : kNothing;
+    const T *g = seen ? p.records + order_.rank_of[i] * int64_t(kRecord) : kNothing;
+    if (seen && any_not_finite(sum, size)) bad = true;
+    for (int c = 0; c < p.chains; ++c) {
+      const T weight = g[kChains0 + 2 * c + kWeight];
+      if (d_weights[c]) d_weights[c][i] = weight > 0 ? sum[kSlotWeight0 + c] / weight : T(0);
+    }
     for (int k = 0; k < p.num_parts; ++k) {
       const Part<T> &part = p.parts[k];
-      T *to = d.d_values[s.first_part + k] + i * part.channels;
+      if (!d_values[k]) continue;
+      T *to = d_values[k] + i * part.channels;
       const T *from = sum + (p.narrow ? kSlotValues + 3 * part.chain : part.slot);
-      seen ? void(std::copy(from, from + part.channels, to)) : std::fill(to, to + part.channels, T(0));
+      if (by_row)
+        bad = bad || any_not_finite(to, part.channels);
+      else if (seen && part.value_grad)
+        std::copy(from, from + part.channels, to);
+      else
+        std::fill(to, to + part.channels, T(0));
     }
-    if (!seen) continue;
-    if (any_not_finite(sum, p.slot_size)) bad = true;
-    const T *g = p.records + order_.rank_of[i] * int64_t(kRecord);
+    if (!seen || !p.shape_grads) continue;
     const T a = g[kInvSigmaX], slope = g[kSlope], b = g[kInvSigmaY];
-    d_mean[0] += kPerOctave2 * a * sum[kMomentU];
-    d_mean[1] += kPerOctave2 * (b * sum[kMomentV] - a * slope * sum[kMomentU]);
-    d_ellipse[0] -= kPerOctave * sum[kMomentUU] / a;
-    d_ellipse[1] += kPerOctave2 * (a / b) * sum[kMomentUV];
-    d_ellipse[2] -= kPerOctave * sum[kMomentVV] / b;
+    if (T *d_mean = d.d_mean2d + 2 * i; d.d_mean2d) {
+      d_mean[0] += kPerOctave2 * a * sum[kMomentU];
+      d_mean[1] += kPerOctave2 * (b * sum[kMomentV] - a * slope * sum[kMomentU]);
+    }
+    if (T *d_ellipse = d.d_ellipse + 3 * i; d.d_ellipse) {
+      d_ellipse[0] -= kPerOctave * sum[kMomentUU] / a;
+      d_ellipse[1] += kPerOctave2 * (a / b) * sum[kMomentUV];
+      d_ellipse[2] -= kPerOctave * sum[kMomentVV] / b;
+    }
   }
   if (!bad) return;
   for (int c = 0; c < p.chains; ++c)
-    check_rows("gradient of a weight must be finite", d.d_weights[s.first_chain + c], n_, 1, -kLargest,
-               kLargest);
+    if (d_weights[c])
+      check_rows("gradient of a weight must be finite", d_weights[c], n_, 1, -kLargest, kLargest);
   for (int k = 0; k < p.num_parts; ++k)
-    check_rows("gradient of groups[" + std::to_string(p.parts[k].group) + "].values must be finite",
-               d.d_values[s.first_part + k], n_, p.parts[k].channels, -kLargest, kLargest);
+    if (d_values[k])
+      check_rows("gradient of groups[" + std::to_string(p.parts[k].group) + "].values must be finite",
+                 d_values[k], n_, p.parts[k].channels, -kLargest, kLargest);
   throw std::invalid_argument(
       "rasterize: gradient of means, quats and scales must be finite, got a number that is not");
 }
@@ -248,16 +301,37 @@ void Blend<T>::write_gradients(const Stage &s, const Buffer<T> &sums, const Blen
 template <class T>
 void Blend<T>::backward(const BlendGrads<T> &d, int threads) const {
   const int tile_threads = worth(lists_.begin.back() + grid_.tiles_x * grid_.tiles_y, threads);
+  if (d.d_mean2d) std::fill_n(d.d_mean2d, 2 * n_, T(0));
+  if (d.d_ellipse) std::fill_n(d.d_ellipse, 3 * n_, T(0));
   for (const Stage &s : stages_) {
     Pass<T> p = s.pass;
     std::vector<Part<T>> parts = s.parts;
-    for (int k = 0; k < p.num_parts; ++k) {
-      parts[k].values = d.values[s.first_part + k];
-      parts[k].d_image = d.d_images[s.first_part + k];
-    }
     p.parts = parts.data();
-    for (int c = 0; c < p.chains; ++c) p.d_alphas[c] = d.d_alphas[s.first_chain + c];
-    write_gradients(s, sum_slots(p, tile_threads), d, worth(n_, threads));
+    p.shape_grads = p.weight_grads = p.value_grads = false;
+    for (int c = 0; c < p.chains; ++c) {
+      p.d_alphas[c] = d.d_alphas[s.first_chain + c];
+      p.used[c] = p.d_alphas[c];
+      p.weight_grads |= d.d_weights[s.first_chain + c] != nullptr;
+    }
+    if (!p.narrow) p.slot_size = kSlotHead;
+    for (int k = 0; k < p.num_parts; ++k) {
+      Part<T> &part = parts[k];
+      T *to = d.d_values[s.first_part + k];
+      part.values = d.values[s.first_part + k];
+      part.d_image = d.d_images[s.first_part + k];
+      part.value_grad = part.d_image && to;
+      part.slot = p.slot_size;
+      p.used[part.chain] |= part.d_image != nullptr;
+      p.value_grads |= part.value_grad;
+      if (part.value_grad && !p.narrow) p.slot_size += part.padded;
+    }
+    if (summed(p) < p.slot_size)
+      for (int k = 0; k < p.num_parts; ++k)
+        if (T *to = d.d_values[s.first_part + k]) std::fill_n(to, n_ * parts[k].channels, T(0));
+    for (int c = 0; c < p.chains; ++c) p.shape_grads |= p.used[c] && p.shape_grad[c];
+    p.shape_grads &= d.d_mean2d || d.d_ellipse;
+    write_gradients(s, p, sum_slots(p, d.d_values.data() + s.first_part, tile_threads), d,
+                    worth(n_, threads));
   }
 }
 

@@ -34,18 +34,19 @@ struct BlendGrads {
   std::vector<const T *> values;    // [n, channels] per part, as they were
   std::vector<const T *> d_images;  // per part; null where unused
   std::vector<const T *> d_alphas;  // per chain; null where unused
-  T *d_mean2d, *d_ellipse;          // [n, 2], [n, 3]
-  std::vector<T *> d_weights;       // [n] per chain
-  std::vector<T *> d_values;        // [n, channels] per part
+  // Written; null where it is not wanted, and then no work goes into it.
+  T *d_mean2d, *d_ellipse;     // [n, 2], [n, 3]
+  std::vector<T *> d_weights;  // [n] per chain
+  std::vector<T *> d_values;   // [n, channels] per part
 };
 
 // One picture: blends on construction and keeps the lists for its gradients.
 template <class T>
 class Blend {
  public:
-  // `parts` are in the order of their chains.
+  // `parts` are in the order of their chains. Without `keep` there is no backward pass.
   Blend(const Grid &, int64_t n, const Splats<T> &, std::vector<Chain<T>>, std::vector<Part<T>> parts,
-        const BlendConfig &, bool *visible, int threads);
+        const BlendConfig &, bool keep, bool *visible, int threads);
 
   void backward(const BlendGrads<T> &, int threads) const;
 
@@ -62,9 +63,11 @@ class Blend {
   };
   Stage make_stage(int first_chain, int num_chains) const;
   void fill_records(Stage &, const Splats<T> &, int threads) const;
-  void render(Stage &, int threads) const;
-  Buffer<T> sum_slots(const Pass<T> &, int threads) const;
-  void write_gradients(const Stage &, const Buffer<T> &sums, const BlendGrads<T> &, int threads) const;
+  void check_memory(const Pass<T> &) const;
+  void render(Stage &, bool keep, int threads) const;
+  Buffer<T> sum_slots(const Pass<T> &, T *const *d_values, int threads) const;
+  void write_gradients(const Stage &, const Pass<T> &, const Buffer<T> &sums, const BlendGrads<T> &,
+                       int threads) const;
 
   int64_t n_;
   Grid grid_;

@@ -55,6 +55,22 @@ VLGS_INLINE V native_fma(V a, V b, V c) {
   return a * b + c;
 #endif
 }
+template <class V>
+VLGS_INLINE V native_fnma(V a, V b, V c) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(a[0]) == 4)
+    return (V)_mm512_fnmadd_ps((__m512)a, (__m512)b, (__m512)c);
+  else
+    return (V)_mm512_fnmadd_pd((__m512d)a, (__m512d)b, (__m512d)c);
+#elif defined(__FMA__)
+  if constexpr (sizeof(a[0]) == 4)
+    return (V)_mm256_fnmadd_ps((__m256)a, (__m256)b, (__m256)c);
+  else
+    return (V)_mm256_fnmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#else
+  return c - a * b;
+#endif
+}
 
 template <class T>
 struct Pack {
@@ -113,7 +129,7 @@ VLGS_INLINE Pack<T> fma(const Pack<T> &a, const Pack<T> &b, Pack<T> c) {
 // c - a * b
 template <class T>
 VLGS_INLINE Pack<T> fnma(const Pack<T> &a, const Pack<T> &b, Pack<T> c) {
-  VLGS_FOR_PARTS c.part[i] = native_fma(-a.part[i], b.part[i], c.part[i]);
+  VLGS_FOR_PARTS c.part[i] = native_fnma(a.part[i], b.part[i], c.part[i]);
   return c;
 }
 template <class T>
@@ -125,6 +141,12 @@ template <class T>
 VLGS_INLINE Mask<T> operator<=(const Pack<T> &a, const Pack<T> &b) {
   Mask<T> r;
   VLGS_FOR_PARTS r.part[i] = a.part[i] <= b.part[i];
+  return r;
+}
+template <class T>
+VLGS_INLINE Mask<T> operator<(const Pack<T> &a, const Pack<T> &b) {
+  Mask<T> r;
+  VLGS_FOR_PARTS r.part[i] = a.part[i] < b.part[i];
   return r;
 }
 template <class T>

@@ -11,6 +11,9 @@ struct Mask<float> {
 VLGS_INLINE Mask<float> operator<=(const Pack<float> &a, const Pack<float> &b) {
   return {_mm512_cmp_ps_mask((__m512)a.part[0], (__m512)b.part[0], _CMP_LE_OQ)};
 }
+VLGS_INLINE Mask<float> operator<(const Pack<float> &a, const Pack<float> &b) {
+  return {_mm512_cmp_ps_mask((__m512)a.part[0], (__m512)b.part[0], _CMP_LT_OQ)};
+}
 VLGS_INLINE Mask<float> operator&(Mask<float> a, const Mask<float> &b) {
   return {(__mmask16)(a.bits & b.bits)};
 }

@@ -69,6 +69,7 @@ class BlendFloat:
         images: Sequence[Tensor],
         alphas: Sequence[Tensor],
         visible: Tensor,
+        keep: bool,
         threads: int,
     ) -> None: ...
     def backward(
@@ -76,10 +77,10 @@ class BlendFloat:
         values: Sequence[Tensor],
         d_images: Sequence[Tensor | None],
         d_alphas: Sequence[Tensor | None],
-        d_mean2d: Tensor,
-        d_ellipse: Tensor,
-        d_weights: Sequence[Tensor],
-        d_values: Sequence[Tensor],
+        d_mean2d: Tensor | None,
+        d_ellipse: Tensor | None,
+        d_weights: Sequence[Tensor | None],
+        d_values: Sequence[Tensor | None],
         threads: int,
     ) -> None: ...
 

@@ -157,7 +157,8 @@ class RasterConfig:
     """Slack of the x/z, y/z clamp in the projection's Jacobian, as a share of half the image: x/z is kept in
     ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]`` with m this value."""
     memory_budget: int = 2 << 30
-    """Bytes the tile lists may take; more is refused with an error before anything is allocated."""
+    """Bytes that the tile lists may take, and with them, where a gradient may be asked for, the gradients of the Gaussians before
+    they are summed; more is refused with an error before it is allocated."""
     tile_test: bool = True
     """Whether tiles of the bounding box that the ellipse misses are left out (`vlgs.skips`)."""
     block_masks: bool = True

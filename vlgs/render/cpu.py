@@ -44,7 +44,10 @@ def project(
     config: RasterConfig,
 ) -> Splats:
     """The first of the two autograd functions."""
-    return Splats(*_Project.apply(means, quats, scales, _kernel_camera(camera, config)))
+    tensors = means, quats, scales
+    if not _differentiated(tensors):
+        return Splats(*_project(*tensors, _kernel_camera(camera, config)))
+    return Splats(*_Project.apply(*tensors, _kernel_camera(camera, config)))
 
 
 def blend(
@@ -53,7 +56,11 @@ def blend(
     """The second of the two autograd functions."""
     layout, weights = _lay_out(groups, camera, config)
     values = [groups[i].values for i in layout.order]
-    visible, *pictures = _Blend.apply(layout, *splats, *weights, *values)
+    tensors = (*splats, *weights, *values)
+    if _differentiated(tensors):
+        visible, *pictures = _Blend.apply(layout, *tensors)
+    else:
+        visible, *pictures = _blend(layout, False, *tensors)[1]
     images: list[Tensor] = [visible] * len(groups)
     alphas = list(images)
     for image, i, chain in zip(
@@ -61,6 +68,10 @@ def blend(
     ):
         images[i], alphas[i] = image, pictures[chain]
     return Rendered(tuple(images), tuple(alphas), visible, splats.mean2d)
+
+
+def _differentiated(tensors: Sequence[Tensor]) -> bool:
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
 class _Layout(NamedTuple):
@@ -124,26 +135,21 @@ def freeze(
     splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig
 ) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, Tensor]:
     """A picture of nothing but weights, as the kernel holds it, with `visible` and the accumulated weight."""
-    nothing = ChannelGroup(weight.new_zeros(len(weight), 1), weight.contiguous())
+    nothing = ChannelGroup(weight.new_zeros(len(weight), 1), weight)
     layout, weights = _lay_out([nothing], camera, config)
-    picture, visible, alphas, _ = _draw(layout, splats, weights, [nothing.values])
-    return picture, visible, alphas[0]
+    picture, (visible, alpha, _) = _blend(layout, True, *splats, *weights, nothing.values)
+    return picture, visible, alpha
 
 
-def _draw(
-    layout: _Layout, splats: Splats, weights: Sequence[Tensor], values: Sequence[Tensor]
-) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, list[Tensor], list[Tensor]]:
-    """The kernel's picture with (visible, alpha per chain, image per group)."""
-    depth, size = splats.depth, (layout.height, layout.width)
-    visible = torch.empty(len(depth), dtype=torch.bool)
-    alphas = [depth.new_empty(size) for _ in weights]
-    images = [depth.new_empty(*size, v.shape[1]) for v in values]
-    kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
-    picture = kernel(
-        *splats, weights, layout.shape_grads, values, layout.order,
-        layout.chain_of, layout.config, images, alphas, visible, torch.get_num_threads(),
+def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: _csrc.Camera):
+    """The fields of `Splats`."""
+    mean2d, ellipse = means.new_empty(len(means), 2), means.new_empty(len(means), 3)
+    depth = means.new_empty(len(means))
+    _csrc.project(
+        camera, means.contiguous(), quats.contiguous(), scales.contiguous(),
+        mean2d, ellipse, depth, torch.get_num_threads(),
     )  # fmt: skip
-    return picture, visible, alphas, images
+    return mean2d, ellipse, depth
 
 
 class _Project(torch.autograd.Function):
@@ -152,10 +158,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: _csrc.Camera):
         means, quats, scales = means.contiguous(), quats.contiguous(), scales.contiguous()
-        mean2d, ellipse = means.new_empty(len(means), 2), means.new_empty(len(means), 3)
-        depth = means.new_empty(len(means))
-        threads = torch.get_num_threads()
-        _csrc.project(camera, means, quats, scales, mean2d, ellipse, depth, threads)
+        mean2d, ellipse, depth = _project(means, quats, scales, camera)
         ctx.save_for_backward(means, quats, scales, depth)
         ctx.camera = camera
         ctx.mark_non_differentiable(depth)
@@ -172,35 +175,51 @@ class _Project(torch.autograd.Function):
         return (*grads, None)
 
 
+def _blend(layout: _Layout, keep: bool, *tensors: Tensor):
+    """The kernel's object and the outputs of `_Blend`; nothing is kept for a backward pass unless asked for."""
+    mean2d, ellipse, depth, *rest = [t.contiguous() for t in tensors]
+    num_chains = len(layout.shape_grads)
+    weights, values = rest[:num_chains], rest[num_chains:]
+    size = (layout.height, layout.width)
+    visible = torch.empty(len(depth), dtype=torch.bool)
+    alphas = [depth.new_empty(size) for _ in weights]
+    images = [depth.new_empty(*size, v.shape[1]) for v in values]
+    kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
+    blend = kernel(
+        mean2d, ellipse, depth, weights, layout.shape_grads, values, layout.order, layout.chain_of,
+        layout.config, images, alphas, visible, keep, torch.get_num_threads(),
+    )  # fmt: skip
+    return blend, (visible, *alphas, *images)
+
+
 class _Blend(torch.autograd.Function):
     """Splats, one weight per chain and the values of every group to (visible, alpha per chain, image per group)."""
 
     @staticmethod
-    def forward(
-        ctx: Any, layout: _Layout, mean2d: Tensor, ellipse: Tensor, depth: Tensor, *rest: Tensor
-    ):
-        num_chains = len(layout.shape_grads)
-        rest = tuple(t.contiguous() for t in rest)
-        weights, values = rest[:num_chains], rest[num_chains:]
-        splats = Splats(mean2d, ellipse, depth)
-        ctx.blend, visible, alphas, images = _draw(layout, splats, weights, values)
+    def forward(ctx: Any, layout: _Layout, *tensors: Tensor):
+        tensors = tuple(t.contiguous() for t in tensors)
+        ctx.blend, outputs = _blend(layout, True, *tensors)
+        mean2d, ellipse, _, *rest = tensors
         ctx.save_for_backward(mean2d, ellipse, *rest)
-        ctx.num_chains = num_chains
+        ctx.num_chains = len(layout.shape_grads)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(visible)
-        return (visible, *alphas, *images)
+        ctx.mark_non_differentiable(outputs[0])
+        return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
-        mean2d, ellipse, *rest = ctx.saved_tensors
+        saved = ctx.saved_tensors
         num_chains = ctx.num_chains
         # None for a picture that the loss did not use; the first output is `visible`.
         d_pictures = [None if d is None else d.contiguous() for d in grad_outputs[1:]]
-        grads = [torch.empty_like(t) for t in (mean2d, ellipse, *rest)]
+        # None for an input that needs no gradient; depth, the fourth input, never does.
+        _, needs_mean2d, needs_ellipse, _, *needs_rest = ctx.needs_input_grad
+        needs = (needs_mean2d, needs_ellipse, *needs_rest)
+        grads = [torch.empty_like(t) if n else None for t, n in zip(saved, needs, strict=True)]
         d_mean2d, d_ellipse, *d_rest = grads
         ctx.blend.backward(
-            rest[num_chains:], d_pictures[num_chains:], d_pictures[:num_chains], d_mean2d, d_ellipse,
-            d_rest[:num_chains], d_rest[num_chains:], torch.get_num_threads(),
+            saved[2 + num_chains :], d_pictures[num_chains:], d_pictures[:num_chains],
+            d_mean2d, d_ellipse, d_rest[:num_chains], d_rest[num_chains:], torch.get_num_threads(),
         )  # fmt: skip
         return (None, d_mean2d, d_ellipse, None, *d_rest)

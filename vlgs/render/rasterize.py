@@ -50,7 +50,7 @@ def rasterize(
 
     Raises:
         ValueError: If a shape, dtype or value is not as described, if any number is not finite (tensor and row are named), or
-            if the tile lists would not fit `RasterConfig.memory_budget`.
+            if the tile lists and gradients would not fit `RasterConfig.memory_budget`.
 
     Example:
         >>> splat = torch.tensor([[0.0, 0.0, 2.0]])
