@@ -4,6 +4,7 @@ import hashlib
 import importlib.resources
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,15 +97,52 @@ def instantiate(config: Any, **arguments: Any) -> Any:
         raise
 
 
-def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
+RESULTS_VERSION = 1
+"""Part of every run id; raised by a change that can move a number."""
+
+PLACES = frozenset({"root", "labels", "features", "vocabulary", "cache_bytes", "scene"})
+"""Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
+
+
+def run_id(config: DictConfig, fingerprint: str) -> str:
     """Hash of all that can move a number: the resolved configuration, the data's content and the results version."""
+    return _digest({"config": _moving(config), "data": fingerprint})
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""
+
+    recipe: str
+    """Hash of the configuration without data and seed."""
+    data: str
+    """Hash of how the data is read, wherever it lies and whichever scene it is."""
+    seed: int
+
+
+def identity(config: DictConfig) -> Identity:
+    """What tells runs of a table apart; see `Identity`."""
+    moving = _moving(config)
+    seed = moving.pop("seed")
+    data = OmegaConf.to_container(config.data, resolve=True, throw_on_missing=False)
+    assert isinstance(data, dict)
+    kept = {str(k): v for k, v in data.items() if k not in PLACES}
+    return Identity(_digest(moving), _digest(kept), seed)
+
+
+def _moving(config: DictConfig) -> dict[str, Any]:
+    """The part of a configuration that can move a number, without the data."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     assert isinstance(plain, dict)
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
-    identity = {"config": kept, "data": fingerprint, "results_version": results_version}
-    text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
+    return kept
+
+
+def _digest(content: dict[str, Any]) -> str:
+    content = content | {"results_version": RESULTS_VERSION}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 

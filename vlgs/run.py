@@ -13,13 +13,16 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import CONF, check_config, instantiate, run_id
+from vlgs.config import CONF, RESULTS_VERSION, check_config, identity, instantiate, run_id
 from vlgs.runs import RunFolder
 
 log = logging.getLogger(__name__)
 
 STOPPED = 130
 """Exit status after Ctrl-C, as shells have it."""
+
+BUSY = 75
+"""Exit status where another process is computing this very run."""
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
@@ -31,7 +34,8 @@ def main(config: DictConfig) -> None:
     except (ValueError, OSError, FloatingPointError) as error:
         if not alone:
             raise
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     if status:
         sys.exit(status)
 
@@ -45,13 +49,9 @@ def run(config: DictConfig) -> int:
     check_config(config)
     import torch
 
-    from vlgs.module.state import RESULTS_VERSION
-
     torch.set_num_threads(config.threads)
     scene = instantiate(config.data)
-    folder = RunFolder(
-        Path(config.results) / "runs" / run_id(config, scene.fingerprint, RESULTS_VERSION)
-    )
+    folder = RunFolder(Path(config.results) / "runs" / run_id(config, scene.fingerprint))
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
@@ -151,6 +151,12 @@ def _report(
         "checkpoint_bytes": max(f.stat().st_size for f in folder.checkpoint.glob("*.safetensors")),
         "seed": config.seed,
         "config_hash": folder.path.name,
+        "recipe": identity(config).recipe,
+        "data_recipe": identity(config).data,
+        "dataset": str(HydraConfig.get().runtime.choices["data"]),
+        "scene": scene.name,
+        "fingerprint": scene.fingerprint,
+        "results_version": RESULTS_VERSION,
         "commit": commit(),
         "machine": machine(),
         **asdict(timing),
