@@ -109,6 +109,12 @@ def run_id(config: DictConfig, fingerprint: str) -> str:
     return _digest({"config": _moving(config), "data": fingerprint})
 
 
+def split_override(override: str) -> tuple[str, str]:
+    """Key and value of a command-line argument; the value is empty where there is no ``=``."""
+    key, _, value = override.partition("=")
+    return key, value
+
+
 @dataclass(frozen=True)
 class Identity:
     """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""

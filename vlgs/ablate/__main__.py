@@ -11,7 +11,6 @@ run, or to Hydra's launcher (`hydra...`). A run that exists is not run again, wh
 filled, 1 a run failed (its log is named), 130 stopped by Ctrl-C.
 """
 
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,10 @@ from typing import Any
 
 from rich.console import Console
 
-from vlgs.ablate.plan import Benchmark, Composer, PlannedRun, find, plan
+from vlgs.ablate.plan import PlannedRun, find, plan
+from vlgs.config import split_override
+from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.frame import read_metrics
 from vlgs.tables.registry import Table, choose, load_tables
 
 OWN_KEYS = ("tab", "scenes", "seeds", "name", "results", "dry")
@@ -84,7 +86,7 @@ def read(arguments: Sequence[str]) -> Request:
             overrides.append(argument)
     if "tab" not in own:
         raise ValueError("ablate: tab must be given, as tab=ab-multi or tab=all")
-    given = dict(o.partition("=")[::2] for o in overrides)
+    given = dict(map(split_override, overrides))
     dataset = given.get("data", "synthetic")
     overrides = [f"data={dataset}", *(o for o in overrides if not o.startswith("data="))]
     scenes = _words(own.get("scenes", "")) or _scenes(dataset, given)
@@ -151,21 +153,6 @@ def progress_line(
     )
 
 
-def read_metrics(results: Path) -> list[dict[str, Any]]:
-    """Contents of the metrics.json of every finished run.
-
-    Raises:
-        ValueError: If a file is not JSON; it is named.
-    """
-    runs = []
-    for path in sorted((results / "runs").glob("*/metrics.json")):
-        try:
-            runs.append(json.loads(path.read_text()))
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: must be JSON, got: {error}") from error
-    return runs
-
-
 def _scenes(dataset: str, given: Mapping[str, str]) -> tuple[str, ...]:
     if "data.scene" in given:
         return (given["data.scene"],)
@@ -180,7 +167,9 @@ def _seeds(text: str) -> tuple[int, ...]:
     try:
         numbers = tuple(int(word) for word in _words(text))
     except ValueError as error:
-        raise ValueError(f"ablate: seeds must be a count or a list of integers, got {text}") from error
+        raise ValueError(
+            f"ablate: seeds must be a count or a list of integers, got {text}"
+        ) from error
     if len(numbers) == 1 and "," not in text:
         return tuple(range(numbers[0]))
     return numbers

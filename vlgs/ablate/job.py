@@ -43,7 +43,9 @@ class Outcome:
     def tail(self) -> str:
         """The last lines that it wrote."""
         lines = self.log.read_text(errors="replace").splitlines() if self.log.is_file() else []
-        return "\n".join(line for line in lines if line.strip())[-2000:].rsplit("\n", TAIL_LINES)[-1]
+        return "\n".join(line for line in lines if line.strip())[-2000:].rsplit("\n", TAIL_LINES)[
+            -1
+        ]
 
 
 def run_job(config: DictConfig) -> Outcome:

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hydra import initialize_config_dir
+from hydra._internal.callbacks import Callbacks
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
 from hydra.core.utils import JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
-from hydra._internal.callbacks import Callbacks
 
 from vlgs.ablate.job import Outcome, log_path, run_job
 from vlgs.config import CONF

@@ -40,7 +40,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "seed": ("", "seed of every random draw of the run"),
     "config_hash": ("", "hash of all that can move a number; runs of one hash are one run"),
     "recipe": ("", "hash of the configuration without data and seed: what a row of a table runs"),
-    "data_recipe": ("", "hash of how the data was read, wherever it lies and whichever scene it is"),
+    "data_recipe": (
+        "",
+        "hash of how the data was read, wherever it lies and whichever scene it is",
+    ),
     "dataset": ("", "option of conf/data"),
     "scene": ("", "name of the scene"),
     "fingerprint": ("", "hash of the data's content"),

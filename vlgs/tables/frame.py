@@ -88,7 +88,10 @@ def require_one_meaning(frame: pd.DataFrame) -> None:
     if len(same):
         first = same.iloc[0]
         twins = same[
-            (same[["recipe", "data_recipe", "scene", "seed"]] == first[["recipe", "data_recipe", "scene", "seed"]]).all(axis=1)
+            (
+                same[["recipe", "data_recipe", "scene", "seed"]]
+                == first[["recipe", "data_recipe", "scene", "seed"]]
+            ).all(axis=1)
         ]
         raise ValueError(
             f"results: runs of one row, scene {first['scene']} and seed {first['seed']} must be one, got "

@@ -119,9 +119,7 @@ def load_table(path: Path) -> Table:
     metrics = tuple(content["metrics"])
     for metric in metrics:
         if metric not in QUANTITIES:
-            raise ValueError(
-                f"{where}: metrics must be of {', '.join(QUANTITIES)}, got {metric!r}"
-            )
+            raise ValueError(f"{where}: metrics must be of {', '.join(QUANTITIES)}, got {metric!r}")
     if content.get("by", "scene") not in ("scene", "category"):
         raise ValueError(f"{where}: by must be scene or category, got {content['by']!r}")
     by_category = content.get("by") == "category"
