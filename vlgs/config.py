@@ -4,6 +4,7 @@ import hashlib
 import importlib.resources
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ NOT_PART_OF_A_RUN = frozenset(
 not depend on the folder that its data lies in."""
 
 GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
-"""Keys that name a file to start from: what is in it counts for a run's id, not where it lies."""
+"""Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
 
 def check_config(config: DictConfig) -> None:
@@ -99,18 +100,61 @@ def instantiate(config: Any, **arguments: Any) -> Any:
         raise
 
 
-def run_id(config: DictConfig, fingerprint: str, results_version: int) -> str:
+RESULTS_VERSION = 2
+"""Part of every run id; raised by a change that can move a number."""
+
+PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "cache_bytes", "scene"})
+"""Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
+
+
+def run_id(config: DictConfig, fingerprint: str) -> str:
     """Hash of all that can move a number: the resolved configuration, the data's content and the results version."""
+    return _digest({"config": _moving(config), "data": fingerprint})
+
+
+def split_override(override: str) -> tuple[str, str]:
+    """Key and value of a command-line argument; the value is empty where there is no ``=``."""
+    key, _, value = override.partition("=")
+    return key, value
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""
+
+    recipe: str
+    """Hash of the configuration without data and seed."""
+    data: str
+    """Hash of how the data is read, wherever it lies and whichever scene it is."""
+    seed: int
+
+
+def identity(config: DictConfig) -> Identity:
+    """What tells runs of a table apart; see `Identity`."""
+    moving = _moving(config)
+    seed = moving.pop("seed")
+    data = OmegaConf.to_container(config.data, resolve=True, throw_on_missing=False)
+    assert isinstance(data, dict)
+    kept = {str(k): v for k, v in data.items() if k not in PLACES}
+    return Identity(_digest(moving), _digest(kept), seed)
+
+
+def _moving(config: DictConfig) -> dict[str, Any]:
+    """The part of a configuration that can move a number, without the data."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     assert isinstance(plain, dict)
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
     for group, key in GIVEN_FILES:
-        if isinstance(kept.get(group), dict):
-            kept[group] = {k: v for k, v in kept[group].items() if k != key}
-    identity = {"config": kept, "data": fingerprint, "results_version": results_version}
-    text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
+        if isinstance(kept.get(group), dict) and kept[group].get(key) is not None:
+            kept[group] = {**kept[group], key: Path(kept[group][key]).name}
+    return kept
+
+
+def _digest(content: dict[str, Any]) -> str:
+    content = content | {"results_version": RESULTS_VERSION}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 

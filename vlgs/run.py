@@ -13,16 +13,18 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import CONF, GIVEN_FILES, check_config, instantiate, run_id
-from vlgs.runs import RunFolder
+from vlgs.config import (
+    CONF,
+    GIVEN_FILES,
+    RESULTS_VERSION,
+    check_config,
+    identity,
+    instantiate,
+    run_id,
+)
+from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 
 log = logging.getLogger(__name__)
-
-STOPPED = 130
-"""Exit status after Ctrl-C, as shells have it."""
-
-UNSCORED = 3
-"""Exit status of a run whose scores were asked for and could not be computed: the run is there, its scores are null."""
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
@@ -34,7 +36,8 @@ def main(config: DictConfig) -> None:
     except (ValueError, OSError, FloatingPointError) as error:
         if not alone:
             raise
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     if status:
         sys.exit(status)
 
@@ -49,13 +52,12 @@ def run(config: DictConfig) -> int:
     import torch
 
     from vlgs.interchange import file_digest
-    from vlgs.module.state import RESULTS_VERSION
 
     torch.set_num_threads(config.threads)
     scene = instantiate(config.data)
     given = {key: config[group].get(key) for group, key in GIVEN_FILES}
     content = " ".join([scene.fingerprint, *(file_digest(p, k) for k, p in given.items() if p)])
-    folder = RunFolder(Path(config.results) / "runs" / run_id(config, content, RESULTS_VERSION))
+    folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
@@ -160,6 +162,12 @@ def _report(
         "checkpoint_bytes": max(f.stat().st_size for f in folder.checkpoint.glob("*.safetensors")),
         "seed": config.seed,
         "config_hash": folder.path.name,
+        "recipe": identity(config).recipe,
+        "data_recipe": identity(config).data,
+        "dataset": str(HydraConfig.get().runtime.choices["data"]),
+        "scene": scene.name,
+        "fingerprint": scene.fingerprint,
+        "results_version": RESULTS_VERSION,
         "commit": commit(),
         "machine": machine(),
         **asdict(timing),

@@ -14,6 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+STOPPED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+UNSCORED = 3
+"""Exit status of a run whose scores were asked for and could not be computed: the run is there, its scores are null."""
+
+BUSY = 75
+"""Exit status where another process is computing this very run."""
+
 
 @dataclass(frozen=True)
 class RunFolder:

@@ -1,9 +1,10 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import check_targets, instantiate, run_id
+from vlgs.config import check_targets, identity, instantiate, run_id
 
 
 def config(**changes: object) -> DictConfig:
@@ -19,32 +20,36 @@ def config(**changes: object) -> DictConfig:
 
 
 def test_the_id_ignores_where_things_lie_and_how_many_threads():
-    want = run_id(config(), "f", 1)
+    want = run_id(config(), "f")
     moved = config(
         results="elsewhere",
         threads=1,
         data={"_target_": "vlgs.data.colmap.load_scene", "root": "there"},
     )
-    assert run_id(moved, "f", 1) == want
+    assert run_id(moved, "f") == want
 
 
 @pytest.mark.parametrize(
     "change", [{"seed": 1}, {"blend": {"_target_": "vlgs.blend.BetaBlend", "alpha": 0.1}}]
 )
 def test_the_id_follows_the_configuration(change: dict):
-    assert run_id(config(**change), "f", 1) != run_id(config(), "f", 1)
+    assert run_id(config(**change), "f") != run_id(config(), "f")
 
 
-def test_the_id_follows_what_is_in_the_first_gaussians_not_where_they_lie(tmp_path: Path):
-    ids = []
-    for name, content in (("a.ply", b"one"), ("b.ply", b"one"), ("c.ply", b"two")):
-        (tmp_path / name).write_bytes(content)
-        ids.append(run_id(config(gaussians={"init": str(tmp_path / name)}), "f", 1))
-    assert ids[0] == ids[1] != ids[2]
+def test_the_id_follows_data_and_results_version(monkeypatch: pytest.MonkeyPatch):
+    ids = {run_id(config(), "f"), run_id(config(), "g")}
+    monkeypatch.setattr("vlgs.config.RESULTS_VERSION", 1_000_000)
+    assert len(ids | {run_id(config(), "f")}) == 3
 
 
-def test_the_id_follows_data_and_results_version():
-    assert len({run_id(config(), "f", 1), run_id(config(), "g", 1), run_id(config(), "f", 2)}) == 3
+def test_runs_of_one_recipe_differ_in_seed_scene_and_place_only():
+    here = identity(config())
+    assert identity(config(seed=7)) == replace(here, seed=7)
+    moved = {"_target_": "vlgs.data.colmap.load_scene", "root": "there", "features": "maps"}
+    assert identity(config(data=moved)) == here
+    assert identity(config(data=moved | {"resize": 0.5})).data != here.data
+    assert identity(config(data=moved | {"resize": 0.5})).recipe == here.recipe
+    assert identity(config(blend={"_target_": "vlgs.blend.NoBlend"})).recipe != here.recipe
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ import pytest
 from tiny_runs import TINY, composed
 
 from vlgs.report.results import METRICS
-from vlgs.run import UNSCORED, run
+from vlgs.run import run
+from vlgs.runs import UNSCORED
 from vlgs.runs import RunFolder
 
 SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30")

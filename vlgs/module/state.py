@@ -5,11 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from vlgs.config import RESULTS_VERSION
 from vlgs.module.checkpoint import Checkpoint
 from vlgs.module.lightning import VLGSModule
-
-RESULTS_VERSION = 2
-"""Part of every run id; raised by a change that can move a number."""
 
 
 def capture(module: VLGSModule, meta: dict[str, Any]) -> Checkpoint:

@@ -1,0 +1,176 @@
+"""The printed arrangement of a table, the same for LaTeX, Markdown and HTML."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pandas as pd
+
+from vlgs.tables.fill import Filled
+from vlgs.tables.quantities import QUANTITIES
+from vlgs.tables.registry import AVERAGE
+
+MISSING = "--"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One printed number."""
+
+    mean: float
+    std: float
+    seeds: int
+    paper: float
+    difference: float
+    digits: int
+    rank: int = 0
+    """1 the best of its column and group, 2 the second, else 0."""
+
+    @property
+    def text(self) -> str:
+        """Mean without deviation."""
+        return number(self.mean, self.digits)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One row."""
+
+    group: str
+    label: str
+    marks: tuple[bool, ...]
+    entries: tuple[Entry, ...]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Header and rows."""
+
+    mark_names: tuple[str, ...]
+    columns: tuple[tuple[str, str], ...]
+    """(column, metric) of every entry of a line."""
+    headers: tuple[str, ...]
+    lines: tuple[Line, ...]
+    per_run: tuple[str, ...]
+    """With `by: category`: lines are categories, entries these rows of the table, and their difference."""
+
+
+def number(value: float, digits: int, signed: bool = False) -> str:
+    """A number as printed, or two dashes where there is none."""
+    if not math.isfinite(value):
+        return MISSING
+    return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
+
+
+def arrange(filled: Filled) -> Grid:
+    """Rows as lines and columns as entries; a table by category is turned round."""
+    cells = _entries(filled.cells)
+    if filled.table.by_category:
+        return _by_category(filled, cells)
+    table = filled.table
+    columns = tuple((c, m) for c in filled.columns for m in table.metrics)
+    lines = []
+    for index, row in enumerate(table.rows):
+        entries = tuple(cells[index, c, m] for c, m in columns)
+        lines.append(Line(row.group, row.label, tuple(row.marks.values()), entries))
+    several = len(table.metrics) > 1
+    headers = tuple(
+        (QUANTITIES[m].header if len(filled.columns) == 1 else f"{c} {QUANTITIES[m].header}")
+        if several
+        else c
+        for c, m in columns
+    )
+    mark_names = next((tuple(row.marks) for row in table.rows if row.marks), ())
+    return Grid(mark_names, columns, headers, tuple(_ranked(lines, columns)), ())
+
+
+def _by_category(filled: Filled, cells: Mapping[tuple[int, str, str], Entry]) -> Grid:
+    table, metric = filled.table, filled.table.metrics[0]
+    lines = []
+    for category in filled.columns:
+        entries = tuple(cells[index, category, metric] for index in range(len(table.rows)))
+        first, last = entries[0], entries[-1]
+        gain = Entry(
+            last.mean - first.mean,
+            math.nan,
+            min(first.seeds, last.seeds),
+            last.paper - first.paper,
+            (last.mean - first.mean) - (last.paper - first.paper),
+            first.digits,
+        )
+        lines.append(Line(filled.table.kinds.get(category, ""), category, (), (*entries, gain)))
+    lines.sort(key=lambda line: line.group)
+    labels = tuple(row.label for row in table.rows)
+    columns = tuple((label, metric) for label in (*labels, "Gain"))
+    return Grid((), columns, (*labels, "Gain"), tuple(lines), labels)
+
+
+def _entries(cells: pd.DataFrame) -> dict[tuple[int, str, str], Entry]:
+    """Cells by row, column and metric."""
+    keys = zip(cells["row"].astype(int), cells["column"], cells["metric"], strict=True)
+    numbers = cells[["mean", "std", "seeds", "paper", "difference"]].to_numpy(float)
+    return {
+        key: Entry(mean, std, int(seeds), paper, difference, QUANTITIES[key[2]].digits)
+        for key, (mean, std, seeds, paper, difference) in zip(keys, numbers, strict=True)
+    }
+
+
+def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Line]:
+    """Mark the best and the second of every column; groups are ranked apart, equal prints share a rank."""
+    ranked = {}
+    for group in dict.fromkeys(line.group for line in lines):
+        members = [i for i, line in enumerate(lines) if line.group == group]
+        for column, (_, metric) in enumerate(columns):
+            quantity = QUANTITIES[metric]
+            printed = {
+                i: round(lines[i].entries[column].mean, quantity.digits)
+                for i in members
+                if math.isfinite(lines[i].entries[column].mean)
+            }
+            best = sorted(set(printed.values()), reverse=quantity.higher_is_better)[:2]
+            if len(printed) < 2:
+                continue
+            for i, value in printed.items():
+                if value in best:
+                    ranked[i, column] = best.index(value) + 1
+    return [
+        Line(
+            line.group,
+            line.label,
+            line.marks,
+            tuple(
+                Entry(**(vars(entry) | {"rank": ranked.get((i, j), 0)}))
+                for j, entry in enumerate(line.entries)
+            ),
+        )
+        for i, line in enumerate(lines)
+    ]
+
+
+def caption(filled: Filled) -> str:
+    """The registry's caption and what the numbers are."""
+    seeds = sorted({entry for entry in filled.cells["seeds"] if entry})
+    counts = (
+        "no runs yet"
+        if not seeds
+        else f"{'-'.join(str(s) for s in sorted({min(seeds), max(seeds)}))} seeds"
+    )
+    parts = [filled.table.caption, f"Mean +- standard deviation over {counts}."]
+    if not filled.same_scenes and any(row.paper for row in filled.table.rows):
+        parts.append(
+            f"Scenes are those of {filled.benchmark.name}, not the paper's ({filled.table.dataset}), whose averages stand "
+            f"beside ours for the order of rows only."
+        )
+    if any(row.overrides is None for row in filled.table.rows):
+        parts.append(f"{MISSING}: method not built, or no run.")
+    return " ".join(parts)
+
+
+def has_paper(filled: Filled) -> bool:
+    """Whether any value of the paper is printed."""
+    return bool(filled.cells["paper"].notna().any())
+
+
+def average_index(grid: Grid) -> int | None:
+    """Entry that holds the average."""
+    return next((i for i, (column, _) in enumerate(grid.columns) if column == AVERAGE), None)

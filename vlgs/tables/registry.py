@@ -1,0 +1,184 @@
+"""The registry of ablations: one YAML file per table in `sweeps`, read and checked. Imports no torch.
+
+A row is a command line: `{label, set: [Hydra overrides], paper: values}`. The paper's values are kept as printed and never
+stand in for a run. `sweeps/README.md` describes every key.
+"""
+
+import importlib.resources
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import yaml
+
+from vlgs.tables.quantities import QUANTITIES
+
+_CHECKOUT = Path(__file__).resolve().parents[2] / "sweeps"
+SWEEPS = (
+    _CHECKOUT if _CHECKOUT.is_dir() else Path(str(importlib.resources.files("vlgs"))) / "sweeps"
+)
+"""Folder of the registry: beside the package in a checkout, inside it in an installed wheel."""
+
+AVERAGE = "avg"
+"""Column of the mean over scenes."""
+
+_TABLE_KEYS = {"label", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
+_ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
+_EMPTY: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    label: str
+    overrides: tuple[str, ...] | None
+    """Hydra overrides that make the run; None where the method is not built."""
+    method: str = ""
+    """Name in conf/method of a method that is not built yet."""
+    group: str = ""
+    """Part of the table that the row belongs to."""
+    marks: Mapping[str, bool] = field(default_factory=lambda: _EMPTY)
+    """Switches printed as check marks in columns of their own."""
+    paper: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: _EMPTY)
+    """Column (the paper's scene, ``avg``, or a category) -> metric -> the value printed in the paper."""
+    ours: str = ""
+    """Why a row that the paper does not have is here."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table: what is compared, and what the paper printed."""
+
+    label: str
+    """LaTeX label without ``tab:``; also the file's name."""
+    caption: str
+    dataset: str
+    """Option of conf/data whose scenes the paper's values belong to."""
+    scenes: Mapping[str, str]
+    """The paper's name of a scene -> `data.scene`."""
+    metrics: tuple[str, ...]
+    """Keys of `QUANTITIES`."""
+    rows: tuple[Row, ...]
+    by_category: bool = False
+    """Columns are the categories of a scene instead of scenes."""
+    kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
+    """Category -> ``translucent_reflective`` or ``other``."""
+
+    @property
+    def runnable(self) -> tuple[Row, ...]:
+        """Rows whose method is built."""
+        return tuple(row for row in self.rows if row.overrides is not None)
+
+
+def load_tables(folder: Path = SWEEPS) -> dict[str, Table]:
+    """Read the whole registry, sorted by label.
+
+    Raises:
+        ValueError: Names the file, the key and what it must be.
+    """
+    tables = [load_table(path) for path in sorted(folder.glob("*.yaml"))]
+    if not tables:
+        raise ValueError(f"sweeps: {folder} must hold tables (*.yaml), got none")
+    return {table.label: table for table in tables}
+
+
+def choose(labels: Sequence[str], tables: Mapping[str, Table]) -> list[Table]:
+    """The tables of that name, with or without ``tab:``; ``all`` is every one.
+
+    Raises:
+        ValueError: Names the label and lists those that exist.
+    """
+    names = [label.removeprefix("tab:") for label in labels]
+    if "all" in names:
+        return list(tables.values())
+    for name in names:
+        if name not in tables:
+            raise ValueError(f"tab: must be all or one of {', '.join(tables)}, got {name}")
+    return [tables[name] for name in dict.fromkeys(names)]
+
+
+def load_table(path: Path) -> Table:
+    """Read one file of the registry.
+
+    Raises:
+        ValueError: Names the file, the key and what it must be.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: must be YAML, got: {error}") from error
+    where = str(path)
+    _require_keys(where, content, _TABLE_KEYS, {"label", "caption", "dataset", "metrics", "rows"})
+    if content["label"] != path.stem:
+        raise ValueError(
+            f"{where}: label must be the file's name {path.stem}, got {content['label']}"
+        )
+    metrics = tuple(content["metrics"])
+    for metric in metrics:
+        if metric not in QUANTITIES:
+            raise ValueError(f"{where}: metrics must be of {', '.join(QUANTITIES)}, got {metric!r}")
+    if content.get("by", "scene") not in ("scene", "category"):
+        raise ValueError(f"{where}: by must be scene or category, got {content['by']!r}")
+    by_category = content.get("by") == "category"
+    kinds = content.get("categories", {})
+    columns = set(kinds) if by_category else {*content.get("scenes", {}), AVERAGE}
+    rows = tuple(
+        _row(f"{where}: rows[{i}]", row, metrics, columns) for i, row in enumerate(content["rows"])
+    )
+    if not rows:
+        raise ValueError(f"{where}: rows must be at least 1, got none")
+    return Table(
+        label=content["label"],
+        caption=content["caption"],
+        dataset=content["dataset"],
+        scenes=content.get("scenes", {}),
+        metrics=metrics,
+        rows=rows,
+        by_category=by_category,
+        kinds=kinds,
+    )
+
+
+def _row(where: str, content: Any, metrics: tuple[str, ...], columns: set[str]) -> Row:
+    _require_keys(where, content, _ROW_KEYS, {"label"})
+    if ("set" in content) == ("method" in content):
+        raise ValueError(f"{where}: must have either set or method, got keys {sorted(content)}")
+    overrides = content.get("set")
+    if overrides is not None and not (
+        isinstance(overrides, list) and all(isinstance(o, str) for o in overrides)
+    ):
+        raise ValueError(f"{where}: set must be a list of Hydra overrides, got {overrides!r}")
+    paper: dict[str, dict[str, float]] = {}
+    for column, value in content.get("paper", {}).items():
+        if column not in columns:
+            raise ValueError(
+                f"{where}: paper must have columns of {', '.join(sorted(columns))}, got {column!r}"
+            )
+        values = value if isinstance(value, dict) else {metrics[0]: value}
+        for metric, number in values.items():
+            if metric not in metrics or not isinstance(number, (int, float)):
+                raise ValueError(
+                    f"{where}: paper must give numbers for {', '.join(metrics)}, got {metric}: {number!r}"
+                )
+        paper[column] = {metric: float(number) for metric, number in values.items()}
+    return Row(
+        label=str(content["label"]),
+        overrides=None if overrides is None else tuple(overrides),
+        method=content.get("method", ""),
+        group=content.get("group", ""),
+        marks=content.get("marks", {}),
+        paper=paper,
+        ours=content.get("ours", ""),
+    )
+
+
+def _require_keys(where: str, content: Any, allowed: set[str], needed: set[str]) -> None:
+    if not isinstance(content, dict):
+        raise ValueError(f"{where}: must be a mapping, got {type(content).__name__}")
+    for key in sorted(needed - set(content)):
+        raise ValueError(f"{where}: must have {key}, got keys {sorted(content)}")
+    for key in sorted(set(content) - allowed):
+        raise ValueError(f"{where}: must have no key but {sorted(allowed)}, got {key!r}")
