@@ -15,6 +15,14 @@ def tiny_scene() -> Scene:
 
 
 @pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """SAM and CLIP of a few thousand random weights."""
+    from tiny_models import save_models
+
+    return save_models(tmp_path_factory.mktemp("weights"))
+
+
+@pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real data beside the checkout; tests that need it skip without it."""
     folder = Path(__file__).resolve().parents[2] / "shared"

@@ -10,6 +10,7 @@ from vlgs.check import check_scene
 from vlgs.data.colmap import ColmapSource, load_scene, survey
 from vlgs.data.faults import errors
 from vlgs.data.labels import ObjectFolder, open_labels
+from vlgs.data.labels.objects import LabelledImage
 
 SHARED = Path(__file__).parents[2] / "../shared/data"
 needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason="no real data beside the checkout")
@@ -78,6 +79,7 @@ def test_lerf_ovs_polygons_have_the_area_that_the_file_states():
     assert isinstance(folder, ObjectFolder)
     assert not errors(faults)
     image = folder.images["frame_00140"]
+    assert isinstance(image, LabelledImage)
     assert (image.width, image.height) == (988, 730)
     for item, area in zip(image.objects, (33084.5, 36045.5), strict=True):
         x, y = item.polygon.T

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from colmap_scenes import write_model, write_scene  # pyright: ignore[reportMissingImports]
+from colmap_scenes import write_model, write_scene
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image

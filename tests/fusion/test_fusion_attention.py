@@ -108,7 +108,7 @@ def test_values_and_every_gradient_equal_plain_pytorch(
         inner = fuse.out.in_features
         split = [t.split([inner, 2 * inner]) for t in layers[:2]]
         layers = [split[0][0], split[1][0], split[0][1], split[1][1], *layers[2:]]
-    want = batched(build, fuse.token, *exact[:2], layers)
+    want = batched(build, fuse.token, exact[0], exact[1], layers)
     want_grads = torch.autograd.grad(want, exact, upstream.double())
     for a, b in zip((fused, *got), (want, *want_grads), strict=True):
         # Sums over n terms of size 1: relative to the largest entry.

@@ -77,7 +77,7 @@ def test_gradients_match_finite_differences(degree: int):
     coefficients = torch.randn(4, 15, 3, dtype=torch.float64, requires_grad=True)
     means = (EYE + 1.5 * directions(4)).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda *leaves: view_color(*leaves, EYE, degree),
+        lambda c, sh, m: view_color(c, sh, m, EYE, degree),
         (color, coefficients, means) if degree else (color, coefficients.detach(), means.detach()),
     )
 
@@ -97,9 +97,9 @@ def test_gradients_are_the_same_bits_on_any_number_of_threads():
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            inputs = [leaf.clone().requires_grad_() for leaf in leaves]
-            out = view_color(*inputs, EYE.float(), 3)
-            results.append([out, *torch.autograd.grad(out.square().sum(), inputs)])
+            c, sh, m = (leaf.clone().requires_grad_() for leaf in leaves)
+            out = view_color(c, sh, m, EYE.float(), 3)
+            results.append([out, *torch.autograd.grad(out.square().sum(), [c, sh, m])])
     finally:
         torch.set_num_threads(before)
     for other in results[1:]:

@@ -30,7 +30,7 @@ def test_trimming_the_lists_does_not_change_a_bit(
 ):
     splats = many(channels, dtype)
     assert {"tile_test", "block_masks", "opacity_extent"} == set(SAME_BITS)
-    without = RasterConfig(**dict.fromkeys(switches, False))
+    without = RasterConfig(**dict.fromkeys(switches, False))  # pyright: ignore[reportArgumentType]
     want, want_grads = render_with_gradients(splats)
     got, got_grads = render_with_gradients(splats, config=without)
     pairs = [*zip(got.images, want.images, strict=True), *zip(got.alphas, want.alphas, strict=True)]

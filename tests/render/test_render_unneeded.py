@@ -1,6 +1,7 @@
 """What nobody asks for is not computed, and what is asked for does not change by a bit."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -23,9 +24,7 @@ def _loss(out: Rendered, images: tuple[int, ...]) -> Tensor:
 def _scene(channels: tuple[int, ...]) -> Splats:
     splats = random_splats(300, seed=4, channels=channels).to(torch.float32)
     # Some weights reach the clamp.
-    return Splats(
-        **(vars(splats) | {"weights": tuple(w.sqrt().clamp_min(0.01) for w in splats.weights)})
-    )
+    return replace(splats, weights=tuple(w.sqrt().clamp_min(0.01) for w in splats.weights))
 
 
 @pytest.mark.parametrize("channels", CHANNELS)

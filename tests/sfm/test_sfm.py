@@ -51,7 +51,7 @@ def test_a_similarity_is_found_again_and_never_a_mirror():
 
 
 def test_cameras_are_compared_in_shares_and_degrees(tmp_path: Path):
-    from colmap_scenes import write_scene  # pyright: ignore[reportMissingImports]
+    from colmap_scenes import write_scene
 
     write_scene(tmp_path / "a", text=True)
     shutil.copytree(tmp_path / "a", tmp_path / "b")

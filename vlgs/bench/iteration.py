@@ -122,9 +122,10 @@ def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
     yield module, "_color_loss", "losses, forward"
     yield module, "_language_loss", "losses, forward"
     yield module, "_color_mse", "PSNR of the step"
+    yield module, "_plan_blend", "blended view, forward"
     yield module, "_blended_loss", "blended view, forward"
     yield module.model, "fuse", "activation, forward"
-    yield module.model, "_view_color", "spherical harmonics"
+    yield module.model, "view_color", "spherical harmonics"
     yield module.model, "render", "render, what is left"
 
 

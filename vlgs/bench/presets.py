@@ -14,7 +14,7 @@ from vlgs.module.build import Parts, build_module
 from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
-from vlgs.module.state import RESULTS_VERSION, restore
+from vlgs.module.state import restore
 from vlgs.runs import RunFolder
 from vlgs.types import RasterConfig, Scene
 
@@ -64,7 +64,7 @@ def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
         "config": OmegaConf.to_container(config, resolve=True),
         "fingerprint": scene.fingerprint,
     }
-    folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint, RESULTS_VERSION))
+    folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint))
     folder.path.mkdir(parents=True, exist_ok=True)
     with folder.writing():
         folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))

@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 
 from vlgs.bench.workload import Workload
-from vlgs.gaussians.sh import view_color_residual
-from vlgs.geometry import camera_center
 from vlgs.types import Camera, ChannelGroup
 
 if TYPE_CHECKING:
@@ -30,12 +28,7 @@ def view_of(model: "SplatModel", camera: Camera, seed: int) -> Workload:
     """
     fused = model.fuse()
     g = fused.gaussians
-    colors = fused.color
-    if model.sh_degree > 0:
-        directions = torch.nn.functional.normalize(
-            g.means - camera_center(camera.viewmat), dim=-1, eps=1e-8
-        )
-        colors = colors + view_color_residual(g.shN, directions, model.sh_degree)
+    colors = model.view_color(fused, camera)
     rng = np.random.default_rng(seed)
     pixels = camera.width * camera.height
     upstream = (

@@ -24,7 +24,6 @@ from vlgs.bench.sheet import (
 )
 from vlgs.config import instantiate, run_id
 from vlgs.module.fit import FitOptions, fit
-from vlgs.module.state import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS
 
@@ -131,7 +130,7 @@ def _curve(
     config = composed([*BASE, *overrides, f"seed={seed}", f"threads={threads}", "progress=false"])
     torch.set_num_threads(threads)
     scene = instantiate(config.data)
-    path = curve_path(out / "train", scene.name, run_id(config, scene.fingerprint, RESULTS_VERSION))
+    path = curve_path(out / "train", scene.name, run_id(config, scene.fingerprint))
     if path.is_file():
         say(f"{scene.name}, {label}: {path} is there")
         return read_sheet(path).assign(label=label)

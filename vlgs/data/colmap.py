@@ -186,7 +186,7 @@ def open_training_views(source: ColmapSource, every_view: bool = False) -> tuple
     faults = FaultList(model_faults(model))
     images = ImageFolder(Path(source.root) / source.images, source.resize, PixelCache(0))
     views = faults.take(open_views(model, images))
-    labels = faults.take(_open_labels(source))
+    labels = faults.take(_open_labels(source, views))
     views = faults.take(attach_labels(views, labels, images))
     faults += source.rule.faults(*_names(views), source.root)
     require_sound(faults)

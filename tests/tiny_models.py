@@ -1,13 +1,9 @@
 """SAM and CLIP of a few thousand random weights, in a folder laid out as the real ones are."""
 
 import json
-import sys
 from pathlib import Path
 
-import pytest
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "data"))  # for colmap_scenes
 
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 
@@ -60,9 +56,8 @@ def save_clip(folder: Path) -> None:
     (folder / "preprocessor_config.json").write_text(json.dumps(settings))
 
 
-@pytest.fixture(scope="session")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("weights")
+def save_models(folder: Path) -> Path:
+    """Both, under the names that `vlgs.features` looks for."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         save_sam(folder / "sam-vit-huge")
