@@ -164,7 +164,7 @@ def _report(
         "config_hash": folder.path.name,
         "recipe": identity(config).recipe,
         "data_recipe": identity(config).data,
-        "dataset": str(HydraConfig.get().runtime.choices["data"]),
+        "dataset": _dataset(config),
         "scene": scene.name,
         "fingerprint": scene.fingerprint,
         "results_version": RESULTS_VERSION,
@@ -180,6 +180,13 @@ def _places(folder: RunFolder) -> dict[str, Path]:
     """What the summary points at."""
     places = {"run": folder.path, "pictures": folder.renders / "overview.png", "model": folder.ply}
     return {name: path for name, path in places.items() if path.exists()}
+
+
+def _dataset(config: DictConfig) -> str:
+    """Option of conf/data; where nobody chose one on a command line, the module that reads it."""
+    if HydraConfig.initialized():
+        return str(HydraConfig.get().runtime.choices["data"])
+    return str(config.data._target_).split(".")[-2]
 
 
 def _command() -> str:
