@@ -133,6 +133,8 @@ def identity(config: DictConfig) -> Identity:
     """What tells runs of a table apart; see `Identity`."""
     moving = _moving(config)
     seed = moving.pop("seed")
+    given = {key: config.get(group, {}).get(key) for group, key in GIVEN_FILES}
+    moving["given"] = {key: Path(path).name for key, path in given.items() if path is not None}
     data = OmegaConf.to_container(config.data, resolve=True, throw_on_missing=False)
     assert isinstance(data, dict)
     kept = {str(k): v for k, v in data.items() if k not in PLACES}
@@ -147,8 +149,8 @@ def _moving(config: DictConfig) -> dict[str, Any]:
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
     for group, key in GIVEN_FILES:
-        if isinstance(kept.get(group), dict) and kept[group].get(key) is not None:
-            kept[group] = {**kept[group], key: Path(kept[group][key]).name}
+        if isinstance(kept.get(group), dict):
+            kept[group] = {k: v for k, v in kept[group].items() if k != key}
     return kept
 
 
