@@ -292,6 +292,15 @@ void bind_frozen(nb::module_ &m, const char *name) {
           strict("d_image"), strict("d_values"), "threads"_a);
 }
 
+// At least so many 16-lane multiply-adds of floats in this thread, for who takes the time; returns how many.
+int64_t multiply_adds(int64_t packs) {
+  nb::gil_scoped_release unlocked;
+  const int64_t rounds = packs / kYardstick + 1;
+  volatile float kept = kernels<float>().multiply_add(rounds, 0.5f, 1.0f);
+  (void)kept;
+  return rounds * kYardstick;
+}
+
 }  // namespace
 }  // namespace vlgs
 
@@ -301,6 +310,7 @@ NB_MODULE(_csrc, m) {
   // leak.
   nb::set_leak_warnings(false);
   m.def("isa", &isa);
+  m.def("multiply_adds", &multiply_adds, "packs"_a);
   nb::class_<Camera>(m, "Camera")
       .def(
           "__init__",

@@ -60,21 +60,18 @@ Live live_blocks(const Tile<T> &tile) {
 }
 
 // Pixels of one block to lanes: channels of an image [height, width, channels] become packs. Lanes beyond the
-// image get 0.
+// image stay as they are.
 template <class T>
 inline void to_lanes(const Grid &grid, const T *image, int64_t channels, int64_t x0, int64_t y0, T *packs) {
-  if (x0 >= grid.width || y0 >= grid.height) return;
-  int64_t from[kLanes];
-  bool inside = true;
-  for (int l = 0; l < kLanes; ++l) {
-    const int64_t x = x0 + l % 4, y = y0 + l / 4;
-    inside &= (x < grid.width) & (y < grid.height);
-    from[l] = (y * grid.width + x) * channels;
+  const int64_t columns = grid.width - x0 < kBlock ? grid.width - x0 : kBlock;
+  for (int row = 0; row < kBlock && y0 + row < grid.height && columns > 0; ++row, packs += kBlock) {
+    const T *from = image + ((y0 + row) * grid.width + x0) * channels;
+    if (channels == 3 && columns == kBlock)
+      pixels_to_lanes(from, packs);
+    else
+      for (int64_t x = 0; x < columns; ++x)
+        for (int64_t k = 0; k < channels; ++k) packs[k * kLanes + x] = from[x * channels + k];
   }
-  for (int64_t k = 0; k < channels; ++k)
-    for (int l = 0; l < kLanes; ++l)
-      if (inside || (x0 + l % 4 < grid.width && y0 + l / 4 < grid.height))
-        packs[k * kLanes + l] = image[from[l] + k];
 }
 
 // Gradients of the images of a tile; false if any is not finite.
@@ -114,9 +111,8 @@ enum class Need { kShape, kWeight, kValuesOnly };
 template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *toward,
                       Sums<T, kChains> &sums, Pack<T> *weights) {
-  const Offset<T> o = offset(g, load(state + kCentreX * kLanes), load(state + kCentreY * kLanes));
-  const Pack<T> falloff = exp2_of_minus(o.exponent), zero = splat(T(0)), one = splat(T(1));
-  const Pack<T> alpha_max = splat(tile.alpha_max);
+  const auto [o, falloff] = footprint(g, load(state + kCentreX * kLanes), load(state + kCentreY * kLanes));
+  const Pack<T> zero = splat(T(0)), one = splat(T(1)), alpha_max = splat(tile.alpha_max);
   Pack<T> h = zero;
   for (int c = 0; c < kChains; ++c) {
     weights[c] = zero;
@@ -148,14 +144,14 @@ VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *
   sums.moment[kMomentVV] = fma(hv, o.v, sums.moment[kMomentVV]);
 }
 
-// Three channels per chain: their gradients are summed in registers too.
-template <class T, int kChains, Need kNeed, bool kClamp>
+// Parts of three channels, one per chain or all on one chain: their gradients are summed in registers too.
+template <class T, int kChains, int kParts, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   const bool values = tile.pass->value_grads;
   Pack<T> all[kLanes];
   for (auto &a : all) a = splat(T(0));
   Sums<T, kChains> sums{};
-  Pack<T> d_values[3 * kChains];
+  Pack<T> d_values[3 * kParts];
   for (auto &d : d_values) d = splat(T(0));
   for (; blocks; blocks &= blocks - 1) {
     const int64_t b = __builtin_ctz(blocks);
@@ -163,19 +159,19 @@ VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, const T *g, uint32_t block
     Pack<T> toward[kChains], weights[kChains];
     if constexpr (kNeed != Need::kValuesOnly)
       for (int c = 0; c < kChains; ++c) {
-        toward[c] = load(upstream + (4 * kChains + c) * kLanes);
-        for (int k = 0; k < 3; ++k)
-          toward[c] = fma(splat(g[kValues + 3 * c + k]), load(upstream + (4 * c + k) * kLanes), toward[c]);
+        toward[c] = load(upstream + (4 * kParts + c) * kLanes);
+        for (int k = 3 * c; k < (kChains == 1 ? 3 * kParts : 3 * c + 3); ++k)
+          toward[c] = fma(splat(g[kValues + k]), load(upstream + (k / 3 * 4 + k % 3) * kLanes), toward[c]);
       }
     step<T, kChains, kNeed, kClamp>(tile, g, tile.state + b * state_size(kChains), toward, sums, weights);
     if (values)
-      for (int c = 0; c < kChains; ++c)
-        for (int k = 0; k < 3; ++k)
-          d_values[3 * c + k] = fma(weights[c], load(upstream + (4 * c + k) * kLanes), d_values[3 * c + k]);
+      for (int k = 0; k < 3 * kParts; ++k)
+        d_values[k] = fma(weights[kChains == 1 ? 0 : k / 3], load(upstream + (k / 3 * 4 + k % 3) * kLanes),
+                          d_values[k]);
   }
   for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
   for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
-  for (int c = 0; c < 3 * kChains; ++c) all[kSlotValues + c] = d_values[c];
+  for (int k = 0; k < 3 * kParts; ++k) all[kSlotValues + k] = d_values[k];
   sum_lanes(all, slot);
 }
 
@@ -261,8 +257,10 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
 
 template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
-  if (tile.pass->narrow)
-    gaussian_narrow<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+  if (tile.pass->narrow && tile.pass->num_parts == kChains)
+    gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+  else if (tile.pass->narrow)
+    gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
   else
     gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
 }

@@ -23,7 +23,7 @@ struct Rays {
 
 // The weights a_i T_i of one Gaussian in all chains; false once every pixel is done in every chain.
 template <class T, int kChains, bool kBefore>
-VLGS_INLINE bool weigh(const Pass<T> &p, const T *g, const Centres<T> &at, Rays<T, kChains> &rays,
+VLGS_INLINE bool weigh(const Pass<T> &p, const T *g, const Footprint<T> &print, Rays<T, kChains> &rays,
                        Pack<T> *weights) {
   const Pack<T> floor = splat(kBefore ? T(0) : p.transmittance_min);
   Mask<T> going[kChains];
@@ -32,14 +32,12 @@ VLGS_INLINE bool weigh(const Pass<T> &p, const T *g, const Centres<T> &at, Rays<
   for (int c = 1; c < kChains; ++c) some_going = some_going | going[c];
   if (!any(some_going)) return false;
 
-  const Offset<T> o = offset(g, at.x, at.y);
-  const Pack<T> falloff = exp2_of_minus(o.exponent);
   const Pack<T> zero = splat(T(0));
   for (int c = 0; c < kChains; ++c) {
     const T *chain = g + kChains0 + 2 * c;
-    Mask<T> reached = going[c] & (o.exponent <= splat(chain[kCutoff]));
+    Mask<T> reached = going[c] & (print.o.exponent <= splat(chain[kCutoff]));
     // An alpha of 0 leaves every bit of the transmittance.
-    Pack<T> alpha = select(reached, min(splat(chain[kWeight]) * falloff, splat(p.alpha_max)), zero);
+    Pack<T> alpha = select(reached, min(splat(chain[kWeight]) * print.falloff, splat(p.alpha_max)), zero);
     Pack<T> &t = rays.transmittance[c];
     if constexpr (kBefore) {
       const Mask<T> crosses = reached & (fnma(alpha, t, t) <= splat(p.transmittance_min));
@@ -66,20 +64,29 @@ inline Rays<T, kChains> start_rays(const Pass<T> &p, const Centres<T> &at) {
   return rays;
 }
 
-// Three channels per chain, all in registers.
-template <class T, int kChains, bool kBefore>
+// Parts of three channels, all in registers; one per chain, or all on one chain.
+template <class T, int kChains, int kParts, bool kBefore>
 inline void sum_narrow(const Tile<T> &tile, const Centres<T> &at, int64_t reach, Rays<T, kChains> &rays) {
-  Pack<T> sums[3 * kChains];
+  Pack<T> sums[3 * kParts];
   for (auto &s : sums) s = splat(T(0));
-  for (int64_t j = 0; j < reach; ++j) {
-    const T *g = tile.records + int64_t(tile.list[j]) * kRecord;
-    Pack<T> weights[kChains];
-    if (!weigh<T, kChains, kBefore>(*tile.pass, g, at, rays, weights)) break;
-    for (int c = 0; c < kChains; ++c)
-      for (int k = 0; k < 3; ++k)
-        sums[3 * c + k] = fma(weights[c], splat(g[kValues + 3 * c + k]), sums[3 * c + k]);
+  if (reach == 0) {
+    for (int k = 0; k < 3 * kParts; ++k) store(tile.sums + k * kLanes, sums[k]);
+    return;
   }
-  for (int c = 0; c < 3 * kChains; ++c) store(tile.sums + c * kLanes, sums[c]);
+  tile.list[reach] = tile.list[0];  // a footprint is formed beyond the end, and thrown away
+  const T *next = tile.records + int64_t(tile.list[0]) * kRecord;
+  Footprint<T> next_print = footprint(next, at.x, at.y);
+  for (int64_t j = 0; j < reach; ++j) {
+    const T *g = next;
+    const Footprint<T> print = next_print;
+    next = tile.records + int64_t(tile.list[j + 1]) * kRecord;
+    next_print = footprint(next, at.x, at.y);
+    Pack<T> weights[kChains];
+    if (!weigh<T, kChains, kBefore>(*tile.pass, g, print, rays, weights)) break;
+    for (int k = 0; k < 3 * kParts; ++k)
+      sums[k] = fma(weights[kChains == 1 ? 0 : k / 3], splat(g[kValues + k]), sums[k]);
+  }
+  for (int k = 0; k < 3 * kParts; ++k) store(tile.sums + k * kLanes, sums[k]);
 }
 
 template <class T, int kWidth>
@@ -108,7 +115,8 @@ inline void sum_wide(const Tile<T> &tile, const Centres<T> &at, int64_t reach, R
     for (; count < kWeightsAhead && first + count < reach; ++count) {
       const uint32_t place = tile.list[first + count];
       Pack<T> weights[kChains];
-      going = weigh<T, kChains, kBefore>(p, tile.records + int64_t(place) * kRecord, at, rays, weights);
+      const T *g = tile.records + int64_t(place) * kRecord;
+      going = weigh<T, kChains, kBefore>(p, g, footprint(g, at.x, at.y), rays, weights);
       if (!going) break;
       for (int c = 0; c < kChains; ++c)
         store(tile.weights + (c * kWeightsAhead + count) * kLanes, weights[c]);
@@ -133,17 +141,23 @@ void write_block(const Tile<T> &tile, int b, const T *transmittance) {
   const Pass<T> &p = *tile.pass;
   const int64_t x0 = tile.index % p.grid.tiles_x * kTile + b % 4 * kBlock;
   const int64_t y0 = tile.index / p.grid.tiles_x * kTile + b / 4 * kBlock;
-  for (int l = 0; l < kLanes; ++l) {
-    const int64_t x = x0 + l % 4, y = y0 + l / 4;
-    if (x >= p.grid.width || y >= p.grid.height) continue;
-    const int64_t pixel = y * p.grid.width + x;
-    const T *sums = tile.sums;
+  const int64_t columns = p.grid.width - x0 < kBlock ? p.grid.width - x0 : kBlock;
+  for (int row = 0; row < kBlock && y0 + row < p.grid.height && columns > 0; ++row) {
+    const int64_t pixel = (y0 + row) * p.grid.width + x0;
+    const T *sums = tile.sums + row * kBlock;
     for (int i = 0; i < p.num_parts; ++i) {
-      const Part<T> &part = p.parts[i];
-      for (int64_t k = 0; k < part.channels; ++k, sums += kLanes)
-        part.image[pixel * part.channels + k] = sums[l];
+      const int64_t channels = p.parts[i].channels;
+      T *to = p.parts[i].image + pixel * channels;
+      if (channels == 3 && columns == kBlock)
+        lanes_to_pixels(sums, to);
+      else
+        for (int64_t x = 0; x < columns; ++x)
+          for (int64_t k = 0; k < channels; ++k) to[x * channels + k] = sums[k * kLanes + x];
+      sums += channels * kLanes;
     }
-    for (int c = 0; c < p.chains; ++c) p.alphas[c][pixel] = 1 - transmittance[c * kLanes + l];
+    for (int c = 0; c < p.chains; ++c)
+      for (int64_t x = 0; x < columns; ++x)
+        p.alphas[c][pixel + x] = 1 - transmittance[c * kLanes + row * kBlock + x];
   }
 }
 
@@ -173,8 +187,10 @@ void blend_tile(const Tile<T> &tile) {
     const int64_t reach = list_block(p.masks + tile.begin, tile.count, b, tile.list);
     const Centres<T> at = centres<T>(p.grid, tile.index, b);
     Rays<T, kChains> rays = start_rays<T, kChains>(p, at);
-    if (p.narrow)
-      sum_narrow<T, kChains, kBefore>(tile, at, reach, rays);
+    if (p.narrow && p.num_parts == kChains)
+      sum_narrow<T, kChains, kChains, kBefore>(tile, at, reach, rays);
+    else if (p.narrow)
+      sum_narrow<T, kChains, kNarrowParts, kBefore>(tile, at, reach, rays);
     else
       sum_wide<T, kChains, kBefore>(tile, at, reach, rays);
 

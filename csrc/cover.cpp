@@ -1,5 +1,5 @@
-// Which 4x4 blocks of pixels a Gaussian reaches: row by row, the pixel centres inside its ellipse are an
-// interval.
+// Which tiles a Gaussian may reach, and which 4x4 blocks of their pixels it does: row by row, the pixel
+// centres inside its ellipse are an interval.
 #include "isa.h"
 #include "simd.h"
 
@@ -82,7 +82,46 @@ inline uint16_t mask_of(const BlockRows &rows, int32_t column) {
   return uint16_t(bits[0] | bits[1] | bits[2] | bits[3]);
 }
 
+inline double smaller(double a, double b) { return a < b ? a : b; }
+inline double larger(double a, double b) { return a > b ? a : b; }
+
 }  // namespace
+
+// In double, and the same bits on every instruction set. Loops over kLanes become vector code.
+template <class T>
+void boxes(Grid grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs,
+           Box *out) {
+  const double width = double(grid.width), height = double(grid.height);
+  for (int64_t first = 0; first < count; first += kLanes) {
+    const int64_t some = count - first < kLanes ? count - first : kLanes;
+    double mean_x[kLanes], mean_y[kLanes], inv_x[kLanes], slope[kLanes], inv_y[kLanes], cutoff[kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      const int64_t i = first + (l < some ? l : some - 1);
+      mean_x[l] = mean2d[2 * i], mean_y[l] = mean2d[2 * i + 1];
+      inv_x[l] = ellipse[3 * i] * octaves, slope[l] = ellipse[3 * i + 1];
+      inv_y[l] = ellipse[3 * i + 2] * octaves;
+      cutoff[l] = cutoffs[i];
+    }
+    int32_t x0[kLanes], y0[kLanes], x1[kLanes], y1[kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      const double reach = root(cutoff[l] > 0 ? cutoff[l] : 0), sigma_x = 1 / inv_x[l],
+                   sigma_y = 1 / inv_y[l];
+      const double skew = slope[l] * sigma_y;
+      const double half_x = reach * root(sigma_x * sigma_x + skew * skew) * (1 + 1e-5) + 1e-3;
+      const double half_y = reach * sigma_y * (1 + 1e-5) + 1e-3;
+      // Pixels from the one whose centre may lie just inside to one beyond the last; truncation is floor from
+      // 0 on.
+      const double left = larger(mean_x[l] - half_x + 0.5, 0),
+                   right = smaller(mean_x[l] + half_x + 0.5, width);
+      const double top = larger(mean_y[l] - half_y + 0.5, 0),
+                   bottom = smaller(mean_y[l] + half_y + 0.5, height);
+      const bool hit = (cutoff[l] >= 0) & (left < right) & (top < bottom);
+      x0[l] = int32_t(hit ? left : 0) / kTile, x1[l] = (int32_t(hit ? right : 0) + kTile - 1) / kTile;
+      y0[l] = int32_t(hit ? top : 0) / kTile, y1[l] = (int32_t(hit ? bottom : 0) + kTile - 1) / kTile;
+    }
+    for (int l = 0; l < some; ++l) out[first + l] = {x0[l], y0[l], x1[l], y1[l]};
+  }
+}
 
 template <class T>
 void cover(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
@@ -93,6 +132,8 @@ void cover(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
   }
 }
 
+template void boxes(Grid, int64_t, const float *, const float *, float, const float *, Box *);
+template void boxes(Grid, int64_t, const double *, const double *, double, const double *, Box *);
 template void cover(Grid, const float *, float, Box, uint16_t *);
 template void cover(Grid, const double *, double, Box, uint16_t *);
 

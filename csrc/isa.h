@@ -14,6 +14,8 @@ void project(const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end
 template <class T>
 void project_backward(const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end);
 template <class T>
+void boxes(Grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs, Box *);
+template <class T>
 void cover(Grid, const T *record, T cutoff, Box, uint16_t *masks);
 template <class T>
 int64_t blend_scratch(const Pass<T> &, int64_t list_length);
@@ -30,6 +32,8 @@ void attention(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end,
 template <class T>
 void attention_backward(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
                         int64_t end, T *scratch, AttentionLayers<T *> sums);
+template <class T>
+T multiply_add(int64_t rounds, T factor, T addend);
 template <class T>
 void filter_plane(const Window<T> &, int64_t plane, T *line);
 

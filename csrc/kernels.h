@@ -19,7 +19,10 @@ constexpr int kBlocks = 16;        // blocks of a tile, and bits of a block mask
 constexpr int kPixels = 16;        // pixels of a block, row by row
 constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
 constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
+constexpr int kNarrowParts = 2;    // parts of 3 channels for which a record has room
+constexpr int kYardstick = 10;     // packs of multiply-adds in a round of the yardstick
 constexpr int kFrozenAhead = 16;   // entries between asking for a kept weight and using it
+constexpr int kGatherAhead = 16;   // entries between asking for a record and copying it
 constexpr int kListSlack = 16;     // entries that a block's list may be written beyond its end
 constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
 
@@ -99,7 +102,7 @@ struct Pass {
   T alpha_max, transmittance_min;
   bool stop_before;
   int chains;
-  bool narrow;  // every chain has exactly 3 channels, held in the records
+  bool narrow;  // one part of 3 channels per chain, or two on a single chain, held in the records
   const Part<T> *parts;
   int num_parts;
   int64_t channels;  // of all parts
@@ -142,6 +145,9 @@ struct Kernels {
   // Rows [begin, end).
   void (*project)(const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end);
   void (*project_backward)(const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end);
+  // The tiles in which the pixel centres of `count` ellipses in a row may lie; empty, x0 >= x1, also where
+  // the cutoff is negative. Inverse deviations are brought to octaves by a factor.
+  void (*boxes)(Grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs, Box *);
   // Block masks of one Gaussian over the tiles of a box, row by row.
   void (*cover)(Grid, const T *record, T cutoff, Box, uint16_t *masks);
   // One tile; with scratch as large as its *_scratch says. Backward writes one slot per entry of the tile's
@@ -164,6 +170,9 @@ struct Kernels {
   void (*attention)(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch);
   void (*attention_backward)(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
                              int64_t end, T *scratch, AttentionLayers<T *> sums);
+  // A yardstick: `rounds` times kYardstick multiply-adds of 16 lanes, none of which waits for another of its
+  // round.
+  T (*multiply_add)(int64_t rounds, T factor, T addend);
   // One plane; line has room for width + kTaps numbers.
   void (*filter_plane)(const Window<T> &, int64_t plane, T *line);
 };

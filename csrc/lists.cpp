@@ -21,24 +21,14 @@ struct Candidate {
   uint32_t id;
 };
 
-// Where an ellipse may reach a pixel centre; empty if x0 >= x1. Inverse deviations are per octave, as in
-// records.
+constexpr int64_t kRowsAtOnce = 512;  // between forming cutoffs and looking for the tiles they reach
+
+// The box of one record.
 template <class T>
-Box box_of(const Grid &grid, T mean_x, T mean_y, T inv_sigma_x, T slope, T inv_sigma_y, T cutoff) {
-  const double reach = std::sqrt(double(cutoff)), sigma_x = 1 / double(inv_sigma_x),
-               sigma_y = 1 / double(inv_sigma_y);
-  const double skew = double(slope) * sigma_y;
-  const double half_x = reach * std::sqrt(sigma_x * sigma_x + skew * skew) * (1 + 1e-5) + 1e-3;
-  const double half_y = reach * sigma_y * (1 + 1e-5) + 1e-3;
-  // Pixels from the one whose centre may lie just inside to one beyond the last; truncation is floor from 0
-  // on.
-  const double x0 = std::max(mean_x - half_x + 0.5, 0.0),
-               x1 = std::min(mean_x + half_x + 0.5, double(grid.width));
-  const double y0 = std::max(mean_y - half_y + 0.5, 0.0),
-               y1 = std::min(mean_y + half_y + 0.5, double(grid.height));
-  if (!(x0 < x1 && y0 < y1)) return {0, 0, 0, 0};
-  return {int32_t(x0) / kTile, int32_t(y0) / kTile, (int32_t(x1) + kTile - 1) / kTile,
-          (int32_t(y1) + kTile - 1) / kTile};
+Box box_of(const Grid &grid, const T *record, T cutoff) {
+  Box box;
+  kernels<T>().boxes(grid, 1, record + kMeanX, record + kInvSigmaX, T(1), &cutoff, &box);
+  return box;
 }
 
 // Stable, least significant digit first. Each thread moves a fixed share of the input, so the result is the
@@ -94,7 +84,7 @@ uint16_t trimmed(uint16_t mask, const Trim &trim) {
 // Whether a Gaussian reaches a pixel, where its masks were made for a wider ellipse.
 template <class T>
 bool reaches_any(const Grid &grid, const T *g, T cutoff) {
-  const Box box = box_of(grid, g[kMeanX], g[kMeanY], g[kInvSigmaX], g[kSlope], g[kInvSigmaY], cutoff);
+  const Box box = box_of(grid, g, cutoff);
   std::vector<uint16_t> masks(size_t(Extent<T>{box, cutoff}.tiles()));
   kernels<T>().cover(grid, g, cutoff, box, masks.data());
   return std::any_of(masks.begin(), masks.end(), [](uint16_t mask) { return mask != 0; });
@@ -113,26 +103,31 @@ template <class T>
 DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
                            const std::vector<const T *> &weights, T alpha_min, int threads) {
   const int64_t chains = int64_t(weights.size());
-  DepthOrder<T> order{0, {}, Buffer<uint32_t>(n), Buffer<T>(chains * n)};
+  DepthOrder<T> order{0, {}, Buffer<uint32_t>(n), Buffer<T>(chains * n), Buffer<Box>(n)};
   Buffer<Candidate<T>> candidates(n);
   std::vector<int64_t> kept(threads);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
   for (int t = 0; t < threads; ++t) {
     const Range r = share(n, t, threads);
     int64_t count = 0;
-    for (int64_t i = r.begin; i < r.end; ++i) {
-      for (int64_t c = 0; c < chains; ++c) {
-        const T w = weights[c][i];
-        order.cutoffs[c * n + i] = w >= alpha_min ? std::log2(w / alpha_min) : T(-1);
+    for (int64_t first = r.begin; first < r.end; first += kRowsAtOnce) {
+      const int64_t end = std::min(first + kRowsAtOnce, r.end);
+      T cutoffs[kRowsAtOnce];
+      for (int64_t i = first; i < end; ++i) {
+        for (int64_t c = 0; c < chains; ++c) {
+          const T w = weights[c][i];
+          order.cutoffs[c * n + i] = w >= alpha_min ? std::log2(w / alpha_min) : T(-1);
+        }
+        cutoffs[i - first] = splats.depth[i] > 0 ? widest(order, n, int(chains), i) : T(-1);
       }
-      order.rank_of[i] = kCulled;
-      const T cutoff = widest(order, n, int(chains), i), *mean = splats.mean2d + 2 * i,
-              *e = splats.ellipse + 3 * i;
-      if (!(splats.depth[i] > 0 && cutoff >= 0)) continue;
-      const Box box = box_of(grid, mean[0], mean[1], e[0] * T(kOctaves), e[1], e[2] * T(kOctaves), cutoff);
-      if (box.x0 < box.x1)
-        candidates[r.begin + count++] = {std::bit_cast<decltype(Candidate<T>::depth)>(splats.depth[i]),
-                                         uint32_t(i)};
+      kernels<T>().boxes(grid, end - first, splats.mean2d + 2 * first, splats.ellipse + 3 * first,
+                         T(kOctaves), cutoffs, order.boxes.data() + first);
+      for (int64_t i = first; i < end; ++i) {
+        order.rank_of[i] = kCulled;
+        if (order.boxes[i].x0 < order.boxes[i].x1)
+          candidates[r.begin + count++] = {std::bit_cast<decltype(Candidate<T>::depth)>(splats.depth[i]),
+                                           uint32_t(i)};
+      }
     }
     kept[t] = count;
   }
@@ -157,15 +152,17 @@ TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, co
   const int64_t tiles = grid.tiles_x * grid.tiles_y, m = order.count;
   std::fill(visible, visible + n, false);
 
+  const T full = std::log2(1 / alpha_min);  // the cutoff of a weight of 1
   Buffer<Extent<T>> extents(m);
   Buffer<int64_t> first(m + 1);  // of the masks of each rank
 #pragma omp parallel for num_threads(threads)
   for (int64_t rank = 0; rank < m; ++rank) {
     const T *g = records + rank * kRecord;
-    const T cutoff =
-        trim.opacity_extent ? widest(order, n, chains, order.ids[rank]) : std::log2(1 / alpha_min);
-    extents[rank] = {box_of(grid, g[kMeanX], g[kMeanY], g[kInvSigmaX], g[kSlope], g[kInvSigmaY], cutoff),
-                     cutoff};
+    const uint32_t id = order.ids[rank];
+    if (trim.opacity_extent)
+      extents[rank] = {order.boxes[id], widest(order, n, chains, id)};
+    else
+      extents[rank] = {box_of(grid, g, full), full};
     first[rank + 1] = extents[rank].tiles();
   }
   first[0] = 0;

@@ -21,6 +21,7 @@ struct DepthOrder {
   Buffer<uint32_t> rank_of;  // [n] or kCulled
   Buffer<T>
       cutoffs;  // [chains, n] largest exponent at which alpha_min is reached, negative where it never is
+  Buffer<Box> boxes;  // [n] for the largest of them
 };
 
 // What is left out of the lists; without, they are longer and the pictures the same.

@@ -88,6 +88,7 @@ Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vecto
   }
   lists_ = make_lists(grid, n, order_, stages_[0].records.data(), num_chains, T(config.alpha_min),
                       config.trim, config.memory_budget, visible, row_threads);
+  order_.boxes = {};  // of no use from here on
   for (Stage &s : stages_) {
     if (keep) check_memory(s.pass);
     render(s, keep, worth(lists_.begin.back() + grid.tiles_x * grid.tiles_y, threads));
@@ -114,7 +115,8 @@ typename Blend<T>::Stage Blend<T>::make_stage(int first_chain, int num_chains) c
     part.chain -= first_chain;
     if (part.chain < 0 || part.chain >= num_chains) continue;
     if (s.parts.empty()) s.first_part = int(i);
-    p.narrow = p.narrow && part.channels == 3 && part.chain == int(s.parts.size());
+    const int k = int(s.parts.size());
+    p.narrow = p.narrow && part.channels == 3 && (num_chains == 1 ? k < kNarrowParts : part.chain == k);
     part.padded = (part.channels + 3) / 4 * 4;
     part.slot = p.slot_size;
     p.slot_size += part.padded;
@@ -122,7 +124,6 @@ typename Blend<T>::Stage Blend<T>::make_stage(int first_chain, int num_chains) c
     p.padded_channels += part.padded;
     s.parts.push_back(part);
   }
-  p.narrow = p.narrow && int(s.parts.size()) == num_chains;
   if (p.narrow) p.slot_size = kRecord;
   p.parts = s.parts.data();
   p.num_parts = int(s.parts.size());
@@ -151,10 +152,11 @@ void Blend<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) cons
       g[kChains0 + 2 * c + kWeight] = chains_[s.first_chain + c].weight[i];
       g[kChains0 + 2 * c + kCutoff] = order_.cutoffs[(s.first_chain + c) * n_ + i];
     }
-    for (const Part<T> &part : s.parts) {
+    for (int k = 0; k < p.num_parts; ++k) {
+      const Part<T> &part = s.parts[k];
       const T *values = part.values + i * part.channels;
       if (any_not_finite(values, part.channels)) bad = true;
-      if (p.narrow) std::copy(values, values + 3, g + kValues + 3 * part.chain);
+      if (p.narrow) std::copy(values, values + 3, g + kValues + 3 * k);
     }
   }
   if (!bad) return;
@@ -266,7 +268,7 @@ void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T>
       const Part<T> &part = p.parts[k];
       if (!d_values[k]) continue;
       T *to = d_values[k] + i * part.channels;
-      const T *from = sum + (p.narrow ? kSlotValues + 3 * part.chain : part.slot);
+      const T *from = sum + (p.narrow ? kSlotValues + 3 * k : part.slot);
       if (by_row)
         bad = bad || any_not_finite(to, part.channels);
       else if (seen && part.value_grad)

@@ -1,12 +1,13 @@
 """The subcommands run, and their files say what they hold."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from vlgs.bench.__main__ import SUBCOMMANDS, main
 from vlgs.bench.growth import Point, run_growth
-from vlgs.bench.kernel import Size, run_kernel
+from vlgs.bench.kernel import BOUND_RATE, Size, run_kernel
 from vlgs.bench.sheet import read_sheet
 
 HEADER = {"command", "cpu", "cores", "isa", "load", "commit", "seed", "torch"}
@@ -20,7 +21,7 @@ def header(path: Path) -> set[str]:
 
 def test_kernel_times_both_parts_and_the_reference(tmp_path: Path):
     rows = run_kernel(
-        [Size(60, 32, 24, 1.0)], [Size(20, 16, 12)], [3, 5], [1], ["base"], 2, tmp_path
+        [Size(60, 32, 24, 1.0, 2.0)], [Size(20, 16, 12)], [3, 5], [1], ["base"], 2, tmp_path
     )
     table = read_sheet(tmp_path / "kernel.csv")
     assert header(tmp_path / "kernel.csv") >= HEADER
@@ -30,6 +31,14 @@ def test_kernel_times_both_parts_and_the_reference(tmp_path: Path):
     assert (table.forward_ms > 0).all()
     assert rows[0].ratio == pytest.approx(1.0 / (rows[0].forward.ms + rows[0].backward.ms))
     assert table.opensplat_ms.notna().tolist() == [True, True, False, False, False, False]
+    # The bound is that of projected splats with 3 + 3 channels on two threads and another machine.
+    assert table.bound_ms.notna().tolist() == [False, True, False, False, False, False]
+    rate = re.search(r"multiply_add_rate: ([0-9.]+) G/s", (tmp_path / "kernel.csv").read_text())
+    assert rate is not None
+    assert table.bound_ms[1] == pytest.approx(2 * 2.0 * BOUND_RATE / float(rate[1]), rel=0.01)
+    assert table.over_bound[1] == pytest.approx(
+        (table.forward_ms[1] + table.backward_ms[1]) / table.bound_ms[1], rel=1e-4
+    )  # six digits are written
 
 
 def test_growth_has_slopes_within_a_series(tmp_path: Path):

@@ -41,9 +41,10 @@ def test_trimming_the_lists_does_not_change_a_bit(
         assert torch.equal(got_grads[name], gradient), name
 
 
-def test_a_shared_chain_is_two_equal_chains():
-    splats = many((3, 5), torch.float64)
-    splats = replace(splats, weights=(splats.weights[0],) * 2)
+@pytest.mark.parametrize("channels", [(3, 3), (3, 5), (3, 3, 3)])
+def test_a_shared_chain_is_as_many_equal_chains(channels: tuple[int, ...]):
+    splats = many(channels, torch.float64)
+    splats = replace(splats, weights=(splats.weights[0],) * len(channels))
     want, want_grads = render_with_gradients(splats, config=RasterConfig(share_chains=False))
     got, got_grads = render_with_gradients(splats)
     for a, b in zip((*got.images, *got.alphas), (*want.images, *want.alphas), strict=True):

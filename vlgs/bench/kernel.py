@@ -5,11 +5,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from time import thread_time
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from vlgs import _csrc
 from vlgs.bench.child import Child, free_memory
 from vlgs.bench.clock import Pass, Spread, spreads, take_turns, time_pass
 from vlgs.bench.sheet import provenance, say, show, write_sheet
@@ -33,16 +35,21 @@ class Size(NamedTuple):
     opensplat_ms: float | None = None
     """OpenSplat 15b7e800, `rasterizer/gsplat-cpu`, colour and language as two passes of three channels, forward and backward
     from projected splats; it has one thread. Median on an idle 2-core AMD EPYC (Zen 5, 4.4 GHz): other machines differ."""
+    bound_ms: float | None = None
+    """Lane-limited bound of forward and backward from projected splats, 3 + 3 channels, on 2 cores of a machine with
+    `BOUND_RATE`: live 4x4 blocks times the time of one in a loop of its own. An estimate for one kernel, no law of nature."""
 
 
 SIZES = (
-    Size(10_000, 320, 240, 398),
-    Size(50_000, 320, 240, 483),
-    Size(200_000, 320, 240, 699),
-    Size(10_000, 640, 480, 1867),
-    Size(50_000, 640, 480, 2160),
-    Size(200_000, 640, 480, 2784),
+    Size(10_000, 320, 240, 398, 6.1),
+    Size(50_000, 320, 240, 483, 7.7),
+    Size(200_000, 320, 240, 699, 10.7),
+    Size(10_000, 640, 480, 1867, 21.9),
+    Size(50_000, 640, 480, 2160, 25.0),
+    Size(200_000, 640, 480, 2784, 30.6),
 )
+BOUND_RATE = 9.0
+"""Of the machine on which `Size.bound_ms` was measured: 16-lane multiply-adds of floats per core, 1e9 per second."""
 DENSE_SIZES = (Size(300, 80, 60), Size(1_000, 160, 120), Size(300, 320, 240))
 """What the dense reference can do within a few GiB."""
 
@@ -76,6 +83,10 @@ class KernelRow:
     """Published, for the same work; none where it cannot do it."""
     ratio: float | None
     """OpenSplat's time over ours, forward and backward together."""
+    bound_ms: float | None
+    """`Size.bound_ms` for this machine's rate and this many threads; where it holds."""
+    over_bound: float | None
+    """Our time over that, forward and backward together: this compares between machines."""
 
 
 def run_kernel(
@@ -100,12 +111,17 @@ def run_kernel(
     rows: list[KernelRow] = []
     with ExitStack() as stack:
         children = _children(isas, stack)
+        # The best that the machine does, whichever sets are timed.
+        rate = stack.enter_context(Child(ISAS[0])).call(multiply_add_rate)
+        header["multiply_add_rate"] = f"{rate:.2f} G/s per core, 16 lanes of float"
+        say(f"{rate:.2f} G multiply-adds of 16 floats per second and core")
         for size in sizes:
             for width in channels:
-                rows += _measure(children, size, width, threads, ("call", "blend"), repeats, seed)
+                parts = ("call", "blend")
+                rows += _measure(children, size, width, threads, parts, repeats, seed, rate)
         for size in dense_sizes:
             parts = ("call", "reference")
-            rows += _measure(children, size, 3, threads, parts, max(3, repeats // 3), seed)
+            rows += _measure(children, size, 3, threads, parts, max(3, repeats // 3), seed, rate)
     write_sheet(out / "kernel.csv", rows, header)
     _print(rows)
     return rows
@@ -131,6 +147,7 @@ def _measure(
     parts: Sequence[str],
     repeats: int,
     seed: int,
+    rate: float,
 ) -> Iterable[KernelRow]:
     jobs = [Job(*size[:3], channels, count, part) for count in threads for part in parts]
     variants: dict[tuple[Job, str], Callable[[], Pass]] = {}
@@ -151,12 +168,29 @@ def _measure(
         peer = size.opensplat_ms if channels == 3 else None
         ratio = None if peer is None else peer / (forward.ms + backward.ms)
         isa = "torch" if job.part == "reference" else isa
-        rows.append(KernelRow(job, isa, forward, backward, len(passes), peer, ratio))
+        bound = None
+        if size.bound_ms is not None and channels == 3 and job.part == "blend":
+            bound = size.bound_ms * (2 / job.threads) * (BOUND_RATE / rate)
+        over = None if bound is None else (forward.ms + backward.ms) / bound
+        rows.append(KernelRow(job, isa, forward, backward, len(passes), peer, ratio, bound, over))
     return rows
 
 
 def _time_in(child: Child, job: Job, seed: int) -> Pass:
     return child.call(time_job, job, seed)
+
+
+def multiply_add_rate() -> float:
+    """Fused multiply-adds of 16 floats that one core does, 1e9 per second: the best of some runs of a few milliseconds.
+
+    By CPU time. It is what a machine reaches when nothing waits, so that figures of different machines compare.
+    """
+    rates: list[float] = []
+    for _ in range(15):
+        start = thread_time()
+        done = _csrc.multiply_adds(20_000_000)
+        rates.append(done / (thread_time() - start) / 1e9)
+    return max(rates)
 
 
 def time_job(job: Job, seed: int) -> Pass:
@@ -211,18 +245,19 @@ def _print(rows: Sequence[KernelRow]) -> None:
     lines = []
     for r in rows:
         peer = ("", "") if r.ratio is None else (f"{r.opensplat_ms:.0f}", f"{r.ratio:.1f}")
+        bound = ("", "") if r.bound_ms is None else (f"{r.bound_ms:.1f}", f"{r.over_bound:.2f}")
         lines.append(
             (
                 f"{r.job.gaussians:,}", f"{r.job.width}x{r.job.height}", f"3+{r.job.channels}",
                 f"{r.job.threads}", r.isa, r.job.part,
                 f"{r.forward.ms:.1f} [{r.forward.q1:.1f}, {r.forward.q3:.1f}]",
                 f"{r.backward.ms:.1f} [{r.backward.q1:.1f}, {r.backward.q3:.1f}]",
-                f"{r.forward.ms + r.backward.ms:.1f}", f"{r.forward.cpu + r.backward.cpu:.1f}", *peer,
+                f"{r.forward.ms + r.backward.ms:.1f}", f"{r.forward.cpu + r.backward.cpu:.1f}", *peer, *bound,
             )
         )  # fmt: skip
     columns = ("Gaussians", "image", "channels", "threads", "ISA", "part", "forward", "backward")
     show(
         "rasterizer, ms: median [quartiles] of wall clock; CPU sums over threads",
-        (*columns, "both", "CPU", "OpenSplat", "ratio"),
+        (*columns, "both", "CPU", "OpenSplat", "ratio", "bound", "over it"),
         lines,
     )

@@ -1,0 +1,25 @@
+// What this machine does at best: multiply-adds with nothing to wait for but each other.
+#include "isa.h"
+#include "simd.h"
+
+namespace vlgs::VLGS_ISA_NS {
+
+template <class T>
+T multiply_add(int64_t rounds, T factor, T addend) {
+  using Native = typename Pack<T>::Native;
+  constexpr int kParts = Pack<T>::kParts;
+  const Native a = factor - Native{}, b = addend - Native{};
+  Native sums[kYardstick];  // each from another number, or they would be one
+  for (int k = 0; k < kYardstick; ++k) sums[k] = T(k) * b;
+  // Ten registers at a time hide the latency of any machine and fit where there are sixteen.
+  for (int64_t i = 0; i < rounds * kParts; ++i)
+    for (Native &sum : sums) sum = native_fma(sum, a, b);
+  Native total = {};
+  for (const Native &sum : sums) total += sum;
+  return total[0];
+}
+
+template float multiply_add(int64_t, float, float);
+template double multiply_add(int64_t, double, double);
+
+}  // namespace vlgs::VLGS_ISA_NS
