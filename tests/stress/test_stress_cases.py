@@ -15,7 +15,7 @@ def marked(case: Case):
     return pytest.param(case, id=case.name, marks=pytest.mark.slow if case.name in SLOW else ())
 
 
-@pytest.mark.parametrize("case", map(marked, stress.CASES))
+@pytest.mark.parametrize("case", [marked(case) for case in stress.CASES])
 def test_case(case: Case):
     verdict = case.run(False)
     assert verdict.passed, f"{case.criterion}\nmeasured: {verdict.measured}"
