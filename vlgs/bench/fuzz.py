@@ -67,8 +67,8 @@ def make_scene(seed: int) -> FuzzScene:
     """The scene of a seed: up to 200 Gaussians, images up to 69 pixels wide, 1 to 5 groups of 1 to 40 channels."""
     rng = np.random.default_rng(seed)
     tame = bool(rng.integers(2))
-    n = int(rng.choice([0, 1, 2, 7, 40, rng.integers(201)]))
-    width, height = (int(rng.choice([1, 16, 17, rng.integers(1, 70)])) for _ in range(2))
+    n = int(rng.choice([0, 1, 2, 7, 40, int(rng.integers(201))]))
+    width, height = (int(rng.choice([1, 16, 17, int(rng.integers(1, 70))])) for _ in range(2))
     count = int(rng.integers(1, 6))
     chain_of = tuple(int(rng.integers(i + 1)) for i in range(count))
     arrays = {
