@@ -296,8 +296,16 @@ void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T>
     if (d_values[k])
       check_rows("gradient of groups[" + std::to_string(p.parts[k].group) + "].values must be finite",
                  d_values[k], n_, p.parts[k].channels, -kLargest, kLargest);
-  throw std::invalid_argument(
-      "rasterize: gradient of means, quats and scales must be finite, got a number that is not");
+  if (d.d_mean2d) check_rows("gradient of mean2d must be finite", d.d_mean2d, n_, 2, -kLargest, kLargest);
+  if (d.d_ellipse)
+    check_rows("gradient of the ellipses (means, quats, scales) must be finite", d.d_ellipse, n_, 3,
+               -kLargest, kLargest);
+  // A sum of which nothing was asked for.
+  for (int64_t i = 0; i < n_; ++i)
+    if (const uint32_t rank = order_.rank_of[i];
+        rank != kCulled && any_not_finite(sums.data() + rank * size, size))
+      throw std::invalid_argument("rasterize: sums of the gradients must be finite, got others in row " +
+                                  std::to_string(i));
 }
 
 template <class T>

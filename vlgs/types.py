@@ -155,7 +155,9 @@ class RasterConfig:
     """Whether the contribution that crosses `transmittance_min` is still included; ``before`` is 3DGS's."""
     fov_margin: float = 0.3
     """Slack of the x/z, y/z clamp in the projection's Jacobian, as a share of half the image: x/z is kept in
-    ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]`` with m this value."""
+    ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]`` with m this value. The clamp follows the image: a crop (a smaller image with
+    its principal point shifted) clamps earlier than the whole, so that Gaussians further than m W/2 outside the crop are drawn with
+    another shape where they reach into it. Crops equal the whole to rounding for those within the margin, and for all with 1e6."""
     memory_budget: int = 2 << 30
     """Bytes that the tile lists may take, and with them, where a gradient may be asked for, the gradients of the Gaussians before
     they are summed; more is refused with an error before it is allocated."""

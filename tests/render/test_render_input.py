@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from render_scenes import Splats, random_splats, render, render_with_gradients
 from torch import Tensor
 
+from vlgs.render import rasterize
 from vlgs.render.rasterize import check_camera, check_config, check_tensors
 from vlgs.types import Camera, ChannelGroup, RasterConfig
 
@@ -189,3 +190,17 @@ def test_no_groups():
 def test_cameras_that_are_none(viewmat: Tensor, K: Tensor, size: tuple[int, int], message: str):
     with pytest.raises(ValueError, match=message):
         check_camera(Camera(viewmat, K, *size))
+
+
+def test_a_gradient_that_overflows_is_named_with_its_row():
+    means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.1, 3.0]], requires_grad=True)
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4), torch.full((2, 3), 0.1)
+    values = torch.tensor([[1.0], [1e30]])
+    K = torch.tensor([[20.0, 0, 9], [0, 20.0, 7], [0, 0, 1]])
+    out = rasterize(
+        means, quats, scales, [ChannelGroup(values, torch.full((2,), 0.5))], torch.eye(4), K, 18, 14
+    )
+    with pytest.raises(
+        ValueError, match=r"rasterize: gradient of mean2d must be finite, got .* in row \d"
+    ):
+        out.images[0].backward(torch.full_like(out.images[0], 1e30))

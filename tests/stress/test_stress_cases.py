@@ -7,8 +7,15 @@ import pytest
 from vlgs.bench import stress
 from vlgs.bench.stress.case import Case, Verdict
 
+SLOW = ("N1 poisoned gradients", "N1 hostile training")
+"""Trainings, of 20 seconds and more on a busy machine."""
 
-@pytest.mark.parametrize("case", stress.CASES, ids=lambda case: case.name)
+
+def marked(case: Case):
+    return pytest.param(case, id=case.name, marks=pytest.mark.slow if case.name in SLOW else ())
+
+
+@pytest.mark.parametrize("case", [marked(case) for case in stress.CASES])
 def test_case(case: Case):
     verdict = case.run(False)
     assert verdict.passed, f"{case.criterion}\nmeasured: {verdict.measured}"

@@ -7,6 +7,7 @@ stands among those without a gradient, with the reason. Inputs keep away from cu
 import importlib
 import inspect
 import pkgutil
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -21,21 +22,32 @@ from vlgs.blend import FixedBlend, blend_targets
 from vlgs.blend.pose import slerp
 from vlgs.codec.autoencoder import Autoencoder
 from vlgs.codec.identity import Identity
-from vlgs.fusion.attention import CrossAttention, SelfAttention, channel_attention
+from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
 from vlgs.fusion.mlp import MLP
 from vlgs.gaussians.parameters import activate
-from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color_residual
+from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.indicator import ColourOpacity, Learned
-from vlgs.losses import Losses, l1_dssim, masked_cosine, masked_l1, masked_mse, ssim, ssim_map
+from vlgs.losses import (
+    Losses,
+    _filter,  # pyright: ignore[reportPrivateUsage]
+    l1_dssim,
+    masked_cosine,
+    masked_l1,
+    masked_mse,
+    ssim,
+    ssim_map,
+)
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.query.similarity import cosines, decoded_cosines
 from vlgs.render import rasterize
+from vlgs.render.frozen import FrozenView
 from vlgs.render.model import SplatModel
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
 AREAS = ("render", "losses", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+"""What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up."""
 
 NO_GRADIENT = {
     "vlgs.fusion.Fusion.__call__": "protocol",
@@ -51,6 +63,12 @@ NO_GRADIENT = {
     "vlgs.gaussians.init.initialise": "placed once",
     "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
     "vlgs.gaussians.ply.read_ply": "from a file",
+    "vlgs.gaussians.ply.parse_ply": "from a file",
+    "vlgs.gaussians.parameters.complete": "fills a file's gaps",
+    "vlgs.gaussians.sound.broken_rows": "a mask",
+    "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
+    "vlgs.render.frustum.may_see": "a mask",
+    "vlgs.render.cpu.freeze": "the constants of a FrozenView",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
 }
@@ -99,6 +117,23 @@ def shape_alone() -> Check:
 
     K = torch.tensor([[6.0, 0, 2.5], [0, 7, 3], [0, 0, 1]]).double()
     return image, [0.9 * s.weights[0], s.values[0]]
+
+
+def frozen() -> Check:
+    """Values alone: everything else of a frozen view is a constant."""
+    s = make_splats(5, seed=2, size=(6, 5), channels=(2,)).to(torch.float64)
+    kept = FrozenView(s.means, s.quats, s.scales, s.weights[0], view(), SMOOTH)
+    return kept.render, [s.values[0]]
+
+
+def coloring(degree: int) -> Check:
+    """Colours that stay above the clamp at 0; degree 0 does not read the rest."""
+    eye, bright = draw(3, seed=7), 2 + draw(3, 3)
+
+    def color(base: Tensor, shN: Tensor, means: Tensor):
+        return view_color(base, shN, means, eye, degree)
+
+    return color, [bright, 0.1 * draw(3, 15, 3, seed=1), 3 + draw(3, 3, seed=2)]
 
 
 def parameters() -> dict[str, Tensor]:
@@ -169,6 +204,8 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.render.cpu.blend": lambda: rasterizing("cpu", False),
     "vlgs.render.cpu.project": lambda: rasterizing("cpu", True),
     "vlgs.render.reference.rasterize": lambda: rasterizing("reference", False),
+    "vlgs.render.frozen.FrozenView.render": frozen,
+    "vlgs.render.model.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
     "vlgs.render.model.SplatModel.gaussians": lambda: model(
         lambda m: tuple(vars(m.gaussians()).values())
     ),
@@ -184,6 +221,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.losses.masked_cosine": lambda: both(masked_cosine, VALID),
     "vlgs.losses.ssim": lambda: (ssim, [draw(*SIZE), draw(*SIZE, seed=1)]),
     "vlgs.losses.ssim_map": lambda: (ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),
+    "vlgs.losses.ssim_map, its window alone": lambda: (_filter, [draw(2, 13, 3)]),
     "vlgs.losses.l1_dssim": lambda: both(l1_dssim, VALID),
     "vlgs.losses.Losses.color_loss": lambda: (
         lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
@@ -199,11 +237,10 @@ CHECKS: dict[str, Callable[[], Check]] = {
         lambda a, b: blend_targets(a, VALID, b, VALID.flip(1), 0.3, FixedBlend(value=0.3, mask="or"))[0],
         [draw(*SIZE), draw(*SIZE, seed=1)],
     ),
-    "vlgs.fusion.attention.channel_attention": lambda: (
-        channel_attention, [draw(2, 3, 1, 2, 2, seed=i) for i in range(3)]
-    ),
     "vlgs.fusion.attention.SelfAttention.forward": lambda: fuse(SelfAttention(2, 2, 2, init="xavier")),
     "vlgs.fusion.attention.CrossAttention.forward": lambda: fuse(CrossAttention(2, 2, 2, init="xavier")),
+    "vlgs.fusion.attention.SelfAttention.forward of two heads": lambda: fuse(SelfAttention(2, 2, 1, 2, "xavier")),
+    "vlgs.fusion.attention.CrossAttention.forward of two heads": lambda: fuse(CrossAttention(2, 2, 1, 2, "xavier")),
     "vlgs.fusion.mlp.MLP.forward": lambda: fuse(MLP(2, 2, residual=False)),
     "vlgs.fusion.blocks.to_blocks": lambda: (lambda x: to_blocks(x)[:, :, :3], [draw(3, 2)]),
     "vlgs.fusion.blocks.from_blocks": lambda: (lambda x: from_blocks(x.expand(2, 2, BLOCK), 3), [draw(2, 2, 1)]),
@@ -213,9 +250,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     ),
     "vlgs.gaussians.sh.sh_to_rgb": lambda: (sh_to_rgb, [draw(4, 3)]),
     "vlgs.gaussians.sh.rgb_to_sh": lambda: (rgb_to_sh, [draw(4, 3)]),
-    "vlgs.gaussians.sh.view_color_residual": lambda: (
-        lambda s, d: view_color_residual(s, d, 3), [draw(2, 15, 3), draw(2, 3, seed=1)]
-    ),
+    **{f"vlgs.gaussians.sh.view_color of degree {degree}": partial(coloring, degree) for degree in range(4)},
     "vlgs.codec.autoencoder.Autoencoder.encode": lambda: (codec().encode, [draw(3, 5)]),
     "vlgs.codec.autoencoder.Autoencoder.decode": lambda: (codec().decode, [draw(3, 3)]),
     "vlgs.codec.identity.Identity.encode": lambda: (Identity(3).encode, [draw(4, 3)]),
@@ -247,8 +282,8 @@ CHECKS: dict[str, Callable[[], Check]] = {
 
 @pytest.mark.parametrize("name", CHECKS)
 def test_gradient_matches_finite_differences(name: str):
-    function, inputs = CHECKS[name]()
     torch.manual_seed(0)
+    function, inputs = CHECKS[name]()
     leaves = [t.clone().requires_grad_() for t in inputs]
     assert gradcheck(function, leaves)  # pyright: ignore
 
@@ -256,7 +291,7 @@ def test_gradient_matches_finite_differences(name: str):
 def test_every_differentiable_function_is_in_a_list():
     found = {name for area in AREAS for name in public_functions(f"vlgs.{area}")}
     assert len(found) > 40
-    listed = {name.split()[0] for name in CHECKS} | NO_GRADIENT.keys()
+    listed = {re.split("[ ,]", name)[0] for name in CHECKS} | NO_GRADIENT.keys()
     assert not found - listed, "new: add it to CHECKS, or to NO_GRADIENT with the reason"
     assert not listed - found, "gone: take it out"
 

@@ -1,6 +1,6 @@
 """Random hostile scenes through the rasterizer and back: finite numbers or a named error, nothing else (pitfalls N2).
 
-A scene is a function of its seed alone, so that `python -m vlgs.bench fuzz --first SEED --scenes 1` runs a failure again. Half of
+With each scene go random calls of the other kernels (`vlgs.bench.fuzz_layers`). A scene is a function of its seed alone, so that `python -m vlgs.bench fuzz --first SEED --scenes 1` runs a failure again. Half of
 the scenes are tame: every number is one that training can reach, and refusing such a scene is a failure too.
 """
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vlgs.bench.fuzz_layers import run_frozen, run_layers
 from vlgs.render import rasterize
 from vlgs.types import ChannelGroup, RasterConfig
 
@@ -66,8 +67,8 @@ def make_scene(seed: int) -> FuzzScene:
     """The scene of a seed: up to 200 Gaussians, images up to 69 pixels wide, 1 to 5 groups of 1 to 40 channels."""
     rng = np.random.default_rng(seed)
     tame = bool(rng.integers(2))
-    n = int(rng.choice([0, 1, 2, 7, 40, rng.integers(201)]))
-    width, height = (int(rng.choice([1, 16, 17, rng.integers(1, 70)])) for _ in range(2))
+    n = int(rng.choice([0, 1, 2, 7, 40, int(rng.integers(201))]))
+    width, height = (int(rng.choice([1, 16, 17, int(rng.integers(1, 70))])) for _ in range(2))
     count = int(rng.integers(1, 6))
     chain_of = tuple(int(rng.integers(i + 1)) for i in range(count))
     arrays = {
@@ -140,6 +141,9 @@ def run_scene(scene: FuzzScene) -> str | None:
                 leaf.grad.shape == leaf.shape, f"gradient of {name} has shape {leaf.grad.shape}"
             )
             _require(bool(leaf.grad.isfinite().all()), f"gradient of {name} is not finite")
+    # A frozen view also refuses values of Gaussians out of sight, which the rasterizer never reads.
+    if scene.tensors["values0"].isfinite().all():
+        run_frozen(scene.tensors, scene.width, scene.height, scene.config, out.images[0].detach())
     return None
 
 
@@ -156,6 +160,7 @@ def fuzz(seeds: Iterable[int], verbose: bool = False) -> FuzzReport:
             print(f"\rseed {seed}", end=" ", flush=True)
         try:
             refused = run_scene(make_scene(seed))
+            run_layers(seed, POISON)
         except Exception as error:
             report.failures[seed] = f"{type(error).__name__}: {error}"
             continue

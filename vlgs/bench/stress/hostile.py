@@ -1,6 +1,7 @@
 """Hostile input to the rasterizer: poison, needles, extreme scales, empty views, sizes beyond memory (N2 to N9)."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from vlgs.bench.fuzz import fuzz
 from vlgs.bench.stress.case import Case, Verdict, bound, peak_memory, relative_error
 from vlgs.bench.stress.splats import (
     SMOOTH,
+    Splats,
     full_screen,
     make_splats,
     render,
@@ -134,17 +136,45 @@ def crops(full: bool) -> Verdict:
     """A crop rendered with an off-centre camera equals the crop of the render to 1e-6 (1e-5 in float32), Jacobian unclamped."""
     splats = make_splats(5000 if full else 200, seed=8, size=(120, 88))
     config = replace(SMOOTH, fov_margin=1e6)
+    return _crop_errors(lambda corner: splats, config)
+
+
+def crops_with_a_clamp(full: bool) -> Verdict:
+    """With the default fov_margin the same holds of Gaussians whose centres are within the margin of the crop, and of those alone."""
+    n = 5000 if full else 400
+    splats = make_splats(n, seed=8, size=(120, 88))
+    pixels = splats.focal * splats.means[:, :2] / splats.means[:, 2:] + torch.tensor([60.0, 44.0])
+    size = torch.tensor([float(side) for side in CROP])
+    slack = RasterConfig().fov_margin * size / 2
+
+    def inside(corner: tuple[int, int]) -> Splats:
+        start = torch.tensor(corner) - slack
+        return splats.rows(((pixels > start) & (pixels < start + size + 2 * slack)).all(1))
+
+    within = _crop_errors(inside, SMOOTH)
+    beyond = _crop_errors(lambda corner: splats, SMOOTH)
+    return Verdict(
+        f"within the margin: {within.measured}; beyond: {beyond.measured}",
+        within.passed and not beyond.passed,
+    )
+
+
+CROP = (47, 37)
+
+
+def _crop_errors(take: Callable[[tuple[int, int]], Splats], config: RasterConfig) -> Verdict:
+    """Largest difference between a crop and the render of the whole, of the Gaussians that a corner takes."""
     worst = {"float64": 0.0, "float32": 0.0}
+    width, height = CROP
     for dtype, name in ((torch.float64, "float64"), (torch.float32, "float32")):
-        whole, _ = render(splats.to(dtype), config=config)
         for x, y in ((0, 0), (16, 16), (37, 5), (73, 51)):
-            part = replace(
-                splats.to(dtype), width=47, height=37,
-                center=(splats.width / 2 - x, splats.height / 2 - y),
-            )  # fmt: skip
+            splats = take((x, y)).to(dtype)
+            whole, _ = render(splats, config=config)
+            center = (splats.width / 2 - x, splats.height / 2 - y)
+            part = replace(splats, width=width, height=height, center=center)
             crop, _ = render(part, config=config)
             for a, b in zip(crop.images, whole.images, strict=True):
-                error = (a - b[y : y + 37, x : x + 47]).abs().max().item()
+                error = (a - b[y : y + height, x : x + width]).abs().max().item()
                 worst[name] = max(worst[name], error)
     return bound(worst, {"float64": 1e-6, "float32": 1e-5})
 
@@ -296,6 +326,7 @@ HOSTILE = (
     Case("N4 needles", needles),
     Case("N5 near plane and edges", near_and_far),
     Case("N5 crops", crops),
+    Case("N5 crops with a clamp", crops_with_a_clamp),
     Case("N6 full screens at 4k", full_screens_at_4k),
     Case("N6 more than 2^31 pairs", too_many_pairs),
     Case("N7 empty views", empty_views),

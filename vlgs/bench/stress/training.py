@@ -86,10 +86,10 @@ def _poison(name: str, value: float, where: str) -> str:
         if step != 7:
             return
         tensor = (
-            next(module.model.fusion.parameters())
+            next(module.model.fusion.parameters())  # pyright: ignore
             if name == "fusion"
             else module.model.splats[name]
-        )  # pyright: ignore
+        )
         if where == "parameter":
             with torch.no_grad():
                 tensor[5] = value

@@ -1,0 +1,144 @@
+"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, the window of SSIM, frozen views.
+
+What `vlgs.bench.fuzz` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
+four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vlgs.fusion.attention import CrossAttention, SelfAttention
+from vlgs.gaussians.sh import view_color
+from vlgs.losses import ssim_map
+from vlgs.render.frozen import FrozenView
+from vlgs.types import Camera, RasterConfig
+
+ROWS = (0, 1, 2, 15, 16, 17, 40)
+LONG = (2047, 2048, 2049, 4100)
+"""Around the chunks that one thread takes."""
+SIDES = (1, 2, 10, 11, 12, 15, 16, 17, 33)
+"""Around the window and the lanes."""
+
+
+def run_layers(seed: int, poison: tuple[float, ...]) -> None:
+    """Each kernel once, both ways.
+
+    Args:
+        seed: Of everything that is drawn.
+        poison: What is strewn in.
+
+    Raises:
+        AssertionError: If a shape is wrong, or a number is not finite though all that went in were ordinary.
+    """
+    rng = np.random.default_rng([seed, 1])
+    for run in (_attention, _view_color, _window):
+        bad = float(rng.choice(poison)) if rng.random() < 0.25 else None
+        _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
+
+
+def run_frozen(
+    tensors: dict[str, Tensor], width: int, height: int, config: RasterConfig, picture: Tensor
+) -> None:
+    """The first group of a scene as a frozen view: the same picture to rounding, finite gradients.
+
+    Args:
+        tensors: Of a `vlgs.bench.fuzz.FuzzScene` that was rendered without complaint.
+        width: Pixels.
+        height: Pixels.
+        config: The scene's.
+        picture: What the rasterizer drew.
+
+    Raises:
+        AssertionError: If the pictures differ, or a gradient is not finite.
+    """
+    camera = Camera(tensors["viewmat"], tensors["K"], width, height)
+    view = FrozenView(
+        tensors["means"], tensors["quats"], tensors["scales"], tensors["weight0"], camera, config
+    )
+    values = tensors["values0"].clone().requires_grad_()
+    image = view.render(values)
+    # Sums of up to 200 terms in another order.
+    bound = 200 * torch.finfo(values.dtype).eps * (values.detach().abs().amax().item() if len(values) else 0.0)  # fmt: skip
+    difference = (image - picture).detach().abs().amax().item()
+    _require(difference <= bound, f"frozen view is off by {difference}, more than {bound}")
+    (gradient,) = torch.autograd.grad(image, values, torch.ones_like(image))
+    _require(bool(gradient.isfinite().all()), "gradient of a frozen view is not finite")
+
+
+Call = tuple[Callable[..., tuple[Tensor, ...]], list[Tensor]]
+
+
+def _attention(rng: np.random.Generator) -> Call:
+    build = SelfAttention if rng.integers(2) else CrossAttention
+    color, feature = (int(rng.integers(1, 6)) for _ in "cf")
+    width, heads = (int(rng.choice([1, 2, 3, 4, 8])) for _ in "wh")
+    with torch.random.fork_rng():
+        torch.manual_seed(int(rng.integers(1 << 30)))
+        fusion = build(color, feature, width, heads, "xavier")
+    dtype = _dtype(rng)
+    fusion = fusion.to(dtype)
+    n = int(rng.choice(ROWS if rng.random() < 0.8 else LONG))
+    inputs = [_normal(rng, dtype, n, c) * 10.0 ** rng.uniform(-4, 4) for c in (color, feature)]
+    names = [name for name, _ in fusion.named_parameters()]
+
+    def call(color: Tensor, feature: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
+        named = dict(zip(names, weights, strict=True))
+        return torch.func.functional_call(fusion, named, (color, feature))
+
+    return call, [*inputs, *(p.detach() for p in fusion.parameters())]
+
+
+def _view_color(rng: np.random.Generator) -> Call:
+    dtype, degree = _dtype(rng), int(rng.integers(4))
+    n = int(rng.choice(ROWS if rng.random() < 0.8 else LONG))
+    stored = int(rng.integers(degree, 4))
+    means, eye = _normal(rng, dtype, n, 3), _normal(rng, dtype, 3)
+    means[::5] = eye  # in the camera's centre, where there is no direction
+    inputs = [_normal(rng, dtype, n, 3), _normal(rng, dtype, n, (stored + 1) ** 2 - 1, 3), means]
+    return lambda c, sh, m: (view_color(c, sh, m, eye, degree),), inputs
+
+
+def _window(rng: np.random.Generator) -> Call:
+    dtype = _dtype(rng)
+    shape = (*(int(rng.choice(SIDES)) for _ in "hw"), int(rng.integers(1, 4)))
+    images = [torch.from_numpy(rng.random(shape)).to(dtype) for _ in "ab"]
+    return lambda a, b: (ssim_map(a, b),), images
+
+
+def _differentiate(
+    name: str,
+    call: Callable[..., tuple[Tensor, ...]],
+    inputs: list[Tensor],
+    rng: np.random.Generator,
+    bad: float | None,
+) -> None:
+    if bad is not None:
+        picked = inputs[int(rng.integers(len(inputs)))]
+        if picked.numel():
+            row = int(rng.integers(picked.numel()))
+            picked.view(-1)[row] = torch.tensor(bad, dtype=torch.float64).to(picked.dtype)
+    leaves = [t.clone().requires_grad_() for t in inputs]
+    outputs = call(*leaves)
+    upstream = [_normal(rng, out.dtype, *out.shape) for out in outputs]
+    grads = torch.autograd.grad(outputs, leaves, upstream, allow_unused=True)
+    for leaf, grad in zip(leaves, grads, strict=True):
+        _require(grad is None or grad.shape == leaf.shape, f"{name}: a gradient has another shape")
+    if bad is None:
+        found = [*outputs, *(g for g in grads if g is not None)]
+        _require(all(bool(t.isfinite().all()) for t in found), f"{name}: must stay finite")
+
+
+def _normal(rng: np.random.Generator, dtype: torch.dtype, *shape: int) -> Tensor:
+    return torch.from_numpy(np.asarray(rng.standard_normal(shape))).to(dtype)
+
+
+def _dtype(rng: np.random.Generator) -> torch.dtype:
+    return torch.float32 if rng.integers(2) else torch.float64
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise AssertionError(otherwise)
