@@ -140,9 +140,13 @@ def sentence(filled: Filled, metric: str) -> str:
 
     def show(d: Difference) -> str:
         title = f"{d.group.partition(':')[0]} {d.label}".strip()
-        return (
-            f"{title} {d.mean:+.{quantity.digits}f} [{d.low:+.{quantity.digits}f}, {d.high:+.{quantity.digits}f}]"
-            + (f" (paper {d.paper:+.{quantity.digits}f})" if math.isfinite(d.paper) else "")
+        interval = (
+            f"[{d.low:+.{quantity.digits}f}, {d.high:+.{quantity.digits}f}]"
+            if math.isfinite(d.low)
+            else "[one pair, no interval]"
+        )
+        return f"{title} {d.mean:+.{quantity.digits}f} {interval}" + (
+            f" (paper {d.paper:+.{quantity.digits}f})" if math.isfinite(d.paper) else ""
         )
 
     parts = [
