@@ -1,7 +1,7 @@
 """A run without training, and two small tables: `python ablate_fakes.py <overrides>` behaves as `python -m vlgs.run` does.
 
 What a run shall do stands in `<results>/behave.json`: {"<fusion> <scene> <seed>": [what the first try does, the second, ...]}, each of
-``ok``, ``error``, ``kill`` (SIGKILL to itself), ``busy``, ``wait`` (until SIGTERM, then saved), ``other`` (results of another row).
+``ok``, ``error``, ``kill`` (SIGKILL to itself), ``orphan`` (SIGKILL to the worker that started it), ``busy``, ``wait`` (until SIGTERM, then saved), ``other`` (results of another row).
 Every try adds a line to `<results>/ran.txt`.
 """
 
@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
 
+from vlgs.ablate import job
 from vlgs.config import CONF, identity, run_id
 from vlgs.runs import BUSY, STOPPED, RunFolder
 
@@ -28,6 +30,12 @@ rows:
   - {label: Without, set: [fusion=none], paper: {avg: 40.0}}
   - {label: Full, set: [], paper: {avg: 50.0}}
 """
+
+
+def run_faked(config: DictConfig) -> None:
+    """`vlgs.ablate.job.run_job`, pretending, on whichever worker this is called."""
+    job.RUN = (sys.executable, __file__)
+    job.run_job(config)
 
 
 def fake_metrics(overrides: list[str], miou: float = 0.5) -> dict[str, Any]:
@@ -85,6 +93,9 @@ def _main(overrides: list[str]) -> int:
         return BUSY
     if act == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
+    if act == "orphan":
+        os.kill(os.getppid(), signal.SIGKILL)
+        return 1
     if act == "wait":
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(STOPPED))
         (results / "waiting").touch()

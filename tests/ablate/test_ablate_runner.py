@@ -220,7 +220,7 @@ def test_the_command_line_is_split():
             "data=colmap",
             "data.root=/a/photos",
             "seeds=4,7",
-            "hydra/launcher=joblib",
+            "hydra/launcher=processes",
             "threads=1",
         ]
     )
@@ -228,7 +228,7 @@ def test_the_command_line_is_split():
     assert request.benchmark.scenes == ("photos",)
     assert request.benchmark.seeds == (4, 7)
     assert request.benchmark.recorded == ("data=colmap",)
-    assert request.launcher == ("hydra/launcher=joblib", "threads=1")
+    assert request.launcher == ("hydra/launcher=processes", "threads=1")
 
 
 def test_outcomes_are_told_apart():

@@ -3,7 +3,7 @@
     python -m vlgs.ablate tab=ab-multi                         one table (several: tab=ab-multi,ab-cam; every one: tab=all)
     python -m vlgs.ablate tab=all seeds=3 scenes=glassware     seeds 0, 1, 2 of one scene
     python -m vlgs.ablate tab=ab-cam data=colmap data.root=PATH name=my-scene trainer=photos
-    python -m vlgs.ablate tab=all hydra/launcher=joblib hydra.launcher.n_jobs=2 threads=1
+    python -m vlgs.ablate tab=all hydra/launcher=processes hydra.launcher.n_jobs=2 threads=1
 
 Keys: `tab`; `scenes` (default: all of the data set); `seeds` (a count, or a list such as 0,4,7; default 3); `name` (folder of
 the tables below results, default the data set); `results`; `dry=true` only says what would run. Everything else goes to each

@@ -30,7 +30,7 @@ def launch(
     Args:
         commands: Arguments of `vlgs.run`, one sequence per run.
         results: Where runs go.
-        options: Overrides of `hydra` itself: ``hydra/launcher=joblib``, ``hydra.launcher.n_jobs=2``.
+        options: Overrides of `hydra` itself: ``hydra/launcher=processes``, ``hydra.launcher.n_jobs=2``.
         folder: Where jobs say how they go; on a disk that every worker sees.
         first: Number of the first job; numbers are not used twice in a folder.
 

@@ -167,6 +167,21 @@ def caption(filled: Filled) -> str:
     return " ".join(parts)
 
 
+def provenance(filled: Filled) -> list[str]:
+    """Machine, commit, protocol, seeds and data of the runs behind a table."""
+    runs = filled.runs
+
+    def all_of(column: str) -> str:
+        return ", ".join(sorted({str(v) for v in runs[column].dropna()})) or "--"
+
+    return [
+        f"data: {' '.join(filled.benchmark.overrides)}; scenes {', '.join(filled.benchmark.scenes)}; "
+        f"seeds {', '.join(map(str, filled.benchmark.seeds))}",
+        f"runs: {len(runs)}; protocol {all_of('protocol')}; results version {all_of('results_version')}",
+        f"commit: {all_of('commit')}; machine: {all_of('cpu')}",
+    ]
+
+
 def has_paper(filled: Filled) -> bool:
     """Whether any value of the paper is printed."""
     return bool(filled.cells["paper"].notna().any())

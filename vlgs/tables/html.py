@@ -12,8 +12,7 @@ from jinja2 import Environment
 from vlgs.files import write_atomically
 from vlgs.tables import plots
 from vlgs.tables.fill import Filled
-from vlgs.tables.grid import arrange, caption, has_paper, number
-from vlgs.tables.markdown import provenance
+from vlgs.tables.grid import arrange, caption, has_paper, number, provenance
 from vlgs.tables.statistics import sentence
 
 
