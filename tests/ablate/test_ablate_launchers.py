@@ -63,6 +63,9 @@ def test_joblib(tmp_path: Path, killed: bool):
     check_complete(request)
 
 
+@pytest.mark.filterwarnings(
+    "ignore:.*Popen.__del__"
+)  # submitit leaves a process that it did not wait for
 @pytest.mark.parametrize("killed", [False, True])
 def test_submitit_local(tmp_path: Path, killed: bool):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")

@@ -234,7 +234,7 @@ def test_the_command_line_is_split():
 def test_outcomes_are_told_apart():
     assert Outcome(0).done
     assert Outcome(UNSCORED).done
-    assert Outcome(None, 0, "x").lost
+    assert Outcome(None, 0.0, "x").lost
     assert Outcome(-9).lost
     assert Outcome(STOPPED).lost  # by someone else: a queue that wants its machine back
     assert not Outcome(1).lost
@@ -251,3 +251,19 @@ def test_progress_counts_and_estimates():
     # Three remain, two of them half done: two runs' work on two workers.
     assert now.line().endswith("3 remaining, about 40 s left")
     assert "left" not in Count(total=2, done=0).line()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "scenes", "told"),
+    [
+        (("data=synthetic",), ("mirrors",), True),
+        (("data=colmap", "data.root=/a/photos"), ("photos",), False),
+        (("data=colmap", "data.root=/a"), ("one", "two"), True),
+        (("data=lerf_ovs", "data.root=/a"), ("ramen",), True),
+    ],
+)
+def test_a_run_is_told_its_scene_unless_the_folder_is_the_scene(
+    overrides: tuple[str, ...], scenes: tuple[str, ...], told: bool, table: Table
+):
+    runs = plan([table], Benchmark("b", overrides, scenes, (0,)))
+    assert {any(o.startswith("data.scene=") for o in run.overrides) for run in runs} == {told}

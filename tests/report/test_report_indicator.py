@@ -1,11 +1,13 @@
 """The histogram of l - o counts pixels under the kind of their true class."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from vlgs.report.answer import RenderedView
 from vlgs.report.indicator import ANY, Histogram
 from vlgs.types import IGNORE_ID, Camera, DenseLabels, Gaussians, View
 
@@ -14,12 +16,14 @@ from vlgs.types import IGNORE_ID, Camera, DenseLabels, Gaussians, View
 class Flat:
     """A model whose pixel i is Gaussian i alone."""
 
-    codec: object = None
+    codec: Any = None
 
-    def fuse(self) -> object:
+    def fuse(self) -> Any:
         raise NotImplementedError
 
-    def render(self, *_: object, **__: object) -> object:
+    def render(
+        self, camera: Camera, color: bool = True, language: bool = True, fused: Any = None
+    ) -> RenderedView:
         raise NotImplementedError
 
     def render_values(self, camera: Camera, values: Tensor, weight: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vlgs.config import (
@@ -123,8 +123,13 @@ class Composer:
         return Identity(**self._known[key], seed=seed)
 
     def takes_scenes(self) -> bool:
-        """Whether the data set holds several scenes (`data.scene`)."""
-        return "scene" in _compose(list(self.benchmark.overrides)).data
+        """Whether a run is told its scene (`data.scene`), or `data.root` is the scene."""
+        data = _compose(list(self.benchmark.overrides)).data
+        if "scene" not in data:
+            return False
+        if OmegaConf.is_missing(data, "scene") or data.scene is not None:
+            return True
+        return self.benchmark.scenes != (Path(data.root).resolve().name,)
 
     def save(self) -> None:
         """Keep what was composed for the next time."""

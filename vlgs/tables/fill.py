@@ -1,6 +1,7 @@
 """From runs to the numbers of one table: mean and deviation over seeds beside the paper's value."""
 
 import math
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -63,6 +64,8 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
     Raises:
         ValueError: If a row names an option that does not exist.
     """
+    entries = {QUANTITIES[name].entry for name in table.metrics}
+    frame = frame[frame["metric"].isin({"per_category"} if table.by_category else entries)]
     values, hashes, recipes = [], set[str](), dict[int, str]()
     for index, row in enumerate(table.rows):
         if row.overrides is None:
@@ -167,13 +170,15 @@ def _cells(
     table: Table, columns: Sequence[str], long: pd.DataFrame, same: bool
 ) -> Iterator[tuple[object, ...]]:
     names = {scene: paper for paper, scene in table.scenes.items()} | {AVERAGE: AVERAGE}
-    groups = {key: part for key, part in long.groupby(["row", "column", "metric"])["value"]}
+    groups: dict[tuple[int, str, str], list[float]] = {}
+    for *key, value in zip(long["row"], long["column"], long["metric"], long["value"], strict=True):
+        groups.setdefault((key[0], key[1], key[2]), []).append(value)
     for index, row in enumerate(table.rows):
         for column in columns:
             for metric in table.metrics:
-                numbers = groups.get((index, column, metric), pd.Series(dtype=float)).dropna()
-                mean = numbers.mean() if len(numbers) else math.nan
-                std = numbers.std(ddof=1) if len(numbers) > 1 else math.nan
+                numbers = groups.get((index, column, metric), [])
+                mean = statistics.fmean(numbers) if numbers else math.nan
+                std = statistics.stdev(numbers) if len(numbers) > 1 else math.nan
                 paper = math.nan
                 if same:
                     printed = printed_name(column) if table.by_category else names.get(column, "")
