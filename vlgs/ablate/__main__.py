@@ -75,6 +75,8 @@ def main() -> None:
         sys.exit(ablate(read(sys.argv[1:])))
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:  # a second time
+        sys.exit(STOPPED)
 
 
 def read(arguments: Sequence[str]) -> Request:
