@@ -155,3 +155,10 @@ def test_quantities_are_entries_of_metrics_json():
     from vlgs.report.results import METRICS
 
     assert {q.entry for q in QUANTITIES.values()} <= set(METRICS)
+
+
+def test_the_table_of_skips_has_every_switch():
+    from vlgs.skips import SKIPS
+
+    rows = {row.overrides for row in TABLES["skips"].rows}
+    assert rows == {()} | {(s.override(on=s.default == "off"),) for s in SKIPS if s.switchable}

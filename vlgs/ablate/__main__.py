@@ -3,28 +3,40 @@
     python -m vlgs.ablate tab=ab-multi                         one table (several: tab=ab-multi,ab-cam; every one: tab=all)
     python -m vlgs.ablate tab=all seeds=3 scenes=glassware     seeds 0, 1, 2 of one scene
     python -m vlgs.ablate tab=ab-cam data=colmap data.root=PATH name=my-scene trainer=photos
-    python -m vlgs.ablate tab=all hydra/launcher=joblib hydra.launcher.n_jobs=2 threads=1
+    python -m vlgs.ablate tab=all hydra/launcher=processes hydra.launcher.n_jobs=2 threads=1
 
 Keys: `tab`; `scenes` (default: all of the data set); `seeds` (a count, or a list such as 0,4,7; default 3); `name` (folder of
 the tables below results, default the data set); `results`; `dry=true` only says what would run. Everything else goes to each
-run, or to Hydra's launcher (`hydra...`). A run that exists is not run again, whoever made it. Exit status: 0 all tables are
-filled, 1 a run failed (its log is named), 130 stopped by Ctrl-C.
+run, or to Hydra's launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made
+it. Ctrl-C lets the runs save; the same command goes on. Exit status: 0 all tables are filled, 1 a run failed (its last lines
+and its log are shown), 130 stopped by Ctrl-C.
 """
 
+import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import FrameType
 
 from rich.console import Console
+from rich.markup import escape
 
+from vlgs.ablate.job import STOP, Outcome
+from vlgs.ablate.launch import launch
 from vlgs.ablate.plan import PlannedRun, find, plan
+from vlgs.ablate.progress import Count, duration, shown
 from vlgs.config import split_override
+from vlgs.runs import STOPPED
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.frame import read_metrics
 from vlgs.tables.registry import Table, choose, load_tables
+from vlgs.tables.write import write_all
 
 OWN_KEYS = ("tab", "scenes", "seeds", "name", "results", "dry")
 SCENES = {
@@ -37,6 +49,9 @@ SCENES = {
 
 WAIT_SECONDS = 5.0
 """Between two looks at runs that another process is computing."""
+
+TRIES = 3
+"""How often a run is planned again whose worker or process was killed."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +75,8 @@ def main() -> None:
         sys.exit(ablate(read(sys.argv[1:])))
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt:  # a second time
+        sys.exit(STOPPED)
 
 
 def read(arguments: Sequence[str]) -> Request:
@@ -86,7 +100,13 @@ def read(arguments: Sequence[str]) -> Request:
             overrides.append(argument)
     if "tab" not in own:
         raise ValueError("ablate: tab must be given, as tab=ab-multi or tab=all")
+    dry = own.get("dry", "false").lower()
+    if dry not in ("true", "false"):
+        raise ValueError(f"ablate: dry must be true or false, got {dry}")
     given = dict(map(split_override, overrides))
+    if "seed" in given:
+        raise ValueError(f"ablate: seeds must be given as seeds=, got seed={given['seed']}")
+    launcher += [o for o in overrides if o.startswith("threads=")]  # cores to ask a cluster for
     dataset = given.get("data", "synthetic")
     overrides = [f"data={dataset}", *(o for o in overrides if not o.startswith("data="))]
     scenes = _words(own.get("scenes", "")) or _scenes(dataset, given)
@@ -96,61 +116,144 @@ def read(arguments: Sequence[str]) -> Request:
         Benchmark(name, tuple(overrides), scenes, _seeds(own.get("seeds", "3"))),
         Path(own.get("results", "results")),
         tuple(launcher),
-        own.get("dry", "false").lower() in ("true", "1", "yes"),
+        dry == "true",
     )
 
 
+@dataclass
+class Tally:
+    """What is known about the runs beyond their results: it decides what is tried again."""
+
+    failed: dict[str, str] = field(default_factory=dict)
+    """Name -> why, for runs that are not tried again."""
+    lost: Counter[str] = field(default_factory=Counter)
+
+    def add(self, run: PlannedRun, outcome: Outcome) -> None:
+        """Judge one outcome of a run that had no results before it."""
+        if outcome.busy:
+            return
+        if outcome.lost:
+            self.lost[run.name] += 1
+            if self.lost[run.name] < TRIES:
+                return
+        elif outcome.done:
+            return
+        self.failed[run.name] = outcome.reason()
+
+
 def ablate(request: Request) -> int:
-    """Run what is missing.
+    """Run what is missing, then write the tables.
 
     Returns:
         The exit status.
     """
-    from vlgs.ablate.launch import launch
+    console = Console(soft_wrap=True, highlight=False)
+    results, benchmark = request.results, request.benchmark
+    composer = Composer(benchmark, results / "cache" / "recipes.json")
+    planned = plan(request.tables, benchmark, composer)
+    if request.dry:
+        missing, _ = _missing(planned, results, {})
+        console.print(f"{len(planned)} runs, {len(missing)} to do")
+        for run in missing:
+            console.print(f"  python -m vlgs.run {' '.join(run.overrides)}", markup=False)
+        return 0
+    benchmark.extend(results / benchmark.name / "benchmark.yaml")
+    composer.save()
+    # A folder of this process alone: two ablations at once neither mix their logs nor stop each other.
+    folder = results / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"
+    tally = Tally()
+    with stop_file(folder / STOP) as stopping:
+        _run_missing(request, planned, folder, tally, stopping, console)
+    for name, reason in tally.failed.items():
+        text = reason.replace("\n", "\n    ")
+        console.print(f"[red]failed: {name}[/red]\n    {escape(text)}")
+    if stopping.is_set():
+        console.print("stopped and saved; the same command goes on from here")
+        return STOPPED
+    for path in write_all(results, request.tables, benchmark.name, html=True):
+        console.print(f"tables: {path}")
+    return 1 if tally.failed else 0
 
-    console = Console(soft_wrap=True)
-    planned = plan(request.tables, request.benchmark, Composer(request.benchmark))
-    failed: dict[str, str] = {}
-    while True:
-        done = find(read_metrics(request.results))
-        missing = [run for run in planned if run.key not in done and run.name not in failed]
-        console.print(progress_line(planned, missing, failed, done))
-        if not missing:
-            break
-        if request.dry:
-            for run in missing:
-                console.print(f"  python -m vlgs.run {' '.join(run.overrides)}", highlight=False)
-            return 0
-        outcomes = launch([run.overrides for run in missing], request.results, request.launcher)
-        for run, outcome in zip(missing, outcomes, strict=True):
-            if outcome.stopped:
-                raise KeyboardInterrupt
-            if not (outcome.done or outcome.busy):
-                failed[run.name] = f"{outcome.tail()}\n    log: {outcome.log}"
-        if all(outcome.busy for outcome in outcomes):
-            time.sleep(WAIT_SECONDS)  # someone else computes what is left
-    request.benchmark.write(request.results / request.benchmark.name / "benchmark.yaml")
-    for name, reason in failed.items():
-        console.print(f"failed: {name}\n    {reason}", style="red", highlight=False)
-    return 1 if failed else 0
 
-
-def progress_line(
+def _run_missing(
+    request: Request,
     planned: Sequence[PlannedRun],
-    missing: Sequence[PlannedRun],
-    failed: Mapping[str, str],
-    done: Mapping[Any, Mapping[str, Any]],
-) -> str:
-    """How many runs there are, how many remain, and for how long by the time of those that are done."""
-    seconds = sorted(run["train_seconds"] for run in done.values() if run.get("train_seconds"))
-    estimate = ""
-    if missing and seconds:
-        hours = len(missing) * seconds[len(seconds) // 2] / 3600
-        estimate = f", about {hours:.1f} h of training one after the other"
-    return (
-        f"{len(planned)} runs: {len(planned) - len(missing) - len(failed)} done, {len(failed)} failed, "
-        f"{len(missing)} to do{estimate}"
+    folder: Path,
+    tally: Tally,
+    stopping: threading.Event,
+    console: Console,
+) -> None:
+    first, expected = 0, set[str]()
+    while not stopping.is_set():
+        missing, seconds = _missing(planned, request.results, tally.failed)
+        for run in missing:
+            if run.name in expected:  # else this would go on for ever
+                tally.failed[run.name] = "it ended well, but its results are not those of this row"
+        missing = [run for run in missing if run.name not in tally.failed]
+        failed = len(tally.failed)
+        before = Count(len(planned), len(planned) - len(missing) - failed, 0, failed, seconds)
+        console.print(before.line())
+        if not missing:
+            return
+        commands = [run.overrides for run in missing]
+        numbers = range(first, first + len(missing))
+        start = time.perf_counter()
+        with shown(console, before, folder, numbers):
+            outcomes = launch(commands, request.results, request.launcher, folder, first)
+        first += len(missing)
+        if stopping.is_set():
+            return
+        for run, outcome in zip(missing, outcomes, strict=True):
+            tally.add(run, outcome)
+            if outcome.done:
+                expected.add(run.name)
+        console.print(
+            f"  {sum(o.done for o in outcomes)} runs in {duration(time.perf_counter() - start)}"
+        )
+        if all(outcome.busy for outcome in outcomes):
+            console.print(
+                f"  waiting for another process, which computes {len(outcomes)} of the runs"
+            )
+            stopping.wait(WAIT_SECONDS)
+
+
+def _missing(
+    planned: Sequence[PlannedRun], results: Path, failed: Mapping[str, str]
+) -> tuple[list[PlannedRun], float | None]:
+    """Runs without results that are still to be tried, and the median training time of the others."""
+    done = find(read_metrics(results))
+    missing = [run for run in planned if run.key not in done and run.name not in failed]
+    times = sorted(
+        done[run.key]["train_seconds"]
+        for run in planned
+        if run.key in done and done[run.key].get("train_seconds") is not None
     )
+    return missing, times[len(times) // 2] if times else None
+
+
+@contextmanager
+def stop_file(path: Path) -> Iterator[threading.Event]:
+    """Turn Ctrl-C and SIGTERM into a file that all jobs look for, so that they save wherever they run.
+
+    A second signal interrupts at once.
+    """
+    stopping = threading.Event()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stopping.set()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        signal.signal(number, signal.default_int_handler)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield stopping
+        return
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopping
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _scenes(dataset: str, given: Mapping[str, str]) -> tuple[str, ...]:

@@ -1,29 +1,40 @@
-"""One run in a process of its own: what every launcher calls, on whichever machine it puts it."""
+"""One run in a process of its own: what every launcher calls, on whichever machine it puts it.
 
+A job and whoever launched it talk through files of one folder, so that a worker on another machine needs nothing but the shared
+folder: the job writes how it goes (`<number>.json`), and ends early when a file named `stop` appears.
+"""
+
+import json
 import os
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from vlgs.files import write_atomically
 from vlgs.runs import BUSY, STOPPED, UNSCORED
 
 TAIL_LINES = 5
+POLL_SECONDS = 0.5
+STOP = "stop"
+RUN = (sys.executable, "-m", "vlgs.run")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one run ended."""
+    """How far one job is, or how it ended."""
 
-    name: str
-    status: int
-    """Exit status of `vlgs.run`; negative for the signal that killed it."""
-    seconds: float
-    log: Path
+    status: int | None = None
+    """Exit status of `vlgs.run`, negative for the signal that killed it; None while it runs, or where its worker died."""
+    seconds: float = 0.0
+    """Wall time, start-up and evaluation included."""
+    log: str = ""
+    """File of everything that it wrote; empty where it was never started."""
 
     @property
     def done(self) -> bool:
@@ -36,45 +47,95 @@ class Outcome:
         return self.status == BUSY
 
     @property
-    def stopped(self) -> bool:
-        """Whether it was interrupted and saved."""
-        return self.status == STOPPED
+    def lost(self) -> bool:
+        """Whether something outside the run ended it, so that trying again is worth while."""
+        return self.status is None or self.status < 0 or self.status == STOPPED
 
-    def tail(self) -> str:
-        """The last lines that it wrote."""
-        lines = self.log.read_text(errors="replace").splitlines() if self.log.is_file() else []
-        return "\n".join(line for line in lines if line.strip())[-2000:].rsplit("\n", TAIL_LINES)[
-            -1
-        ]
+    def reason(self) -> str:
+        """Why it did not finish, with the last lines that it wrote."""
+        path = Path(self.log)
+        text = path.read_text(errors="replace") if self.log and path.is_file() else ""
+        lines = [line for line in text.splitlines() if line.strip()][-TAIL_LINES:]
+        how = f"exit status {self.status}"
+        if self.status is None:
+            how = "its worker died" if self.log else "it was never started"
+        elif self.status < 0:
+            how = f"killed by signal {-self.status}" + (
+                " (out of memory?)" if self.status == -9 else ""
+            )
+        return "\n".join([how, *lines, *([f"log: {self.log}"] if self.log else [])])
 
 
-def run_job(config: DictConfig) -> Outcome:
-    """Start `python -m vlgs.run` with the overrides of this job, and wait.
+def read_outcome(folder: Path, number: int) -> Outcome:
+    """What the job of that number last said."""
+    try:
+        return Outcome(**json.loads(_record(folder, number).read_text()))
+    except FileNotFoundError:
+        return Outcome()
+
+
+def run_job(config: DictConfig) -> None:
+    """What a Hydra launcher calls: run the overrides of this job."""
+    hydra = HydraConfig.get()
+    run_and_record(Path(hydra.sweep.dir), int(hydra.job.num), list(hydra.overrides.task))
+
+
+def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
+    """Start `python -m vlgs.run` with these overrides and wait.
 
     A run that dies, by an error, a signal or want of memory, takes nothing with it: its log stays, and the others go on.
+
+    Args:
+        folder: Where job and launcher talk.
+        number: Of the job, unique in that folder.
+        overrides: Arguments of `vlgs.run`.
     """
-    overrides = list(HydraConfig.get().overrides.task)
-    log = log_path(Path(config.results), overrides)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "vlgs.run", *overrides, "progress=false"]
-    start = time.perf_counter()
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / f"{number:04d}_{_title(overrides)}.log"
+    command = [*RUN, *overrides, "progress=false"]
+    start, stop = time.time(), folder / STOP
+
+    def record(status: int | None) -> None:
+        outcome = Outcome(status, time.time() - start, str(log))
+        write_atomically(_record(folder, number), json.dumps(asdict(outcome)).encode())
+
+    if stop.exists():
+        record(STOPPED)
+        return
+    record(None)
     with log.open("w") as file:
         file.write(" ".join(command) + "\n")
         file.flush()
+        # A session of its own: Ctrl-C in a terminal reaches it once, as the SIGTERM below, and it saves its step.
         with subprocess.Popen(
-            command, stdout=file, stderr=subprocess.STDOUT, env=os.environ | {"COLUMNS": "120"}
+            command,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"COLUMNS": "120"},
+            start_new_session=True,
         ) as process:
-            try:
-                status = process.wait()
-            except KeyboardInterrupt:
-                process.terminate()  # it ends its step and saves it; a Ctrl-C from the terminal reached it already
-                process.wait()
-                raise
-    return Outcome(log.stem, status, time.perf_counter() - start, log)
+            told = False
+            while process.poll() is None:
+                try:
+                    process.wait(POLL_SECONDS)
+                except subprocess.TimeoutExpired:
+                    stopping = stop.exists()
+                except KeyboardInterrupt:
+                    stopping = True
+                else:
+                    break
+                if stopping and not told:
+                    process.terminate()
+                    told = True
+    record(process.returncode)
 
 
-def log_path(results: Path, overrides: list[str]) -> Path:
-    """Where a run of these overrides logs."""
+def _record(folder: Path, number: int) -> Path:
+    return folder / f"{number:04d}.json"
+
+
+def _title(overrides: Sequence[str]) -> str:
+    """Name of the log: the row, scene and seed, without places and what moves no number."""
     words = [o for o in overrides if not o.startswith(("results=", "hydra", "threads="))]
     name = "_".join(word.replace("data.", "").replace("/", "-") for word in words)
-    return results / "logs" / f"{name[:200]}.log"
+    return name[-120:].lstrip("_.")  # what tells rows apart stands last

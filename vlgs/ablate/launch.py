@@ -1,5 +1,6 @@
 """Hand the missing runs to the Hydra launcher that was chosen."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,38 +9,52 @@ from hydra._internal.callbacks import Callbacks
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
-from hydra.core.utils import JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 
-from vlgs.ablate.job import Outcome, log_path, run_job
+from vlgs.ablate.job import Outcome, read_outcome, run_job
 from vlgs.config import CONF
+
+log = logging.getLogger(__name__)
 
 
 def launch(
-    commands: Sequence[Sequence[str]], results: Path, options: Sequence[str]
+    commands: Sequence[Sequence[str]],
+    results: Path,
+    options: Sequence[str],
+    folder: Path,
+    first: int,
 ) -> list[Outcome]:
     """Run every command on the launcher; a failure is an outcome, not an exception.
 
     Args:
         commands: Arguments of `vlgs.run`, one sequence per run.
-        results: Where runs and logs go.
-        options: Overrides of `hydra` itself: ``hydra/launcher=joblib``, ``hydra.launcher.n_jobs=2``.
+        results: Where runs go.
+        options: Overrides of `hydra` itself: ``hydra/launcher=processes``, ``hydra.launcher.n_jobs=2``.
+        folder: Where jobs say how they go; on a disk that every worker sees.
+        first: Number of the first job; numbers are not used twice in a folder.
 
     Returns:
         One outcome per command, in their order.
 
     Raises:
-        ValueError: If the launcher does not exist or is not installed.
+        ValueError: If the launcher does not exist, is not installed, or could not start a single job.
     """
-    folder = f"results={results.resolve()}"
-    jobs = [[*command, folder] for command in commands]
+    # Literal absolute folders: workers resolve what they are given again, in a folder and an environment of their own.
+    place = f"results={results.resolve()}"
+    own = [f"hydra.sweep.dir={folder.resolve()}", "hydra.sweep.subdir=."]
+    quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+    jobs = [[*command, place] for command in commands]
+    trouble: BaseException | None = None
     with initialize_config_dir(str(CONF), version_base="1.3"):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         try:
             config = hydra.compose_config(
-                "config", [folder, *options], RunMode.MULTIRUN, with_log_configuration=False
+                "config",
+                [place, *quiet, *options, *own],
+                RunMode.MULTIRUN,
+                with_log_configuration=False,
             )
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=HydraContext(hydra.config_loader, Callbacks()),
@@ -48,18 +63,20 @@ def launch(
             )
         except HydraException as error:
             raise ValueError(
-                f"ablate: launcher must exist and be installed (pip install 'vlgs[cluster]' or 'vlgs[ray]'), got: {error}"
+                "ablate: hydra/launcher must exist and be installed (pip install 'vlgs[cluster]' or 'vlgs[ray]'), "
+                f"got: {error}"
             ) from error
         state = Singleton.get_state()
         try:
-            returns = launcher.launch(jobs, initial_job_idx=0)
+            launcher.launch(jobs, initial_job_idx=first)
+        except Exception as error:  # launchers are other people's code: every one has errors of its own for a lost worker
+            trouble = error
         finally:
             Singleton.set_state(state)
-    outcomes = []
-    for job, done in zip(jobs, returns, strict=True):
-        if done.status == JobStatus.COMPLETED:
-            outcomes.append(done.return_value)
-        else:  # the launcher itself lost it: a worker died
-            log = log_path(results, job)
-            outcomes.append(Outcome(log.stem, -1, 0.0, log))
+    outcomes = [read_outcome(folder, first + index) for index in range(len(jobs))]
+    if trouble is not None:
+        said = f"{type(trouble).__name__}: {str(trouble).strip().partition(chr(10))[0]}"
+        if not any(outcome.log for outcome in outcomes):
+            raise ValueError(f"ablate: the launcher must start jobs, got {said}") from trouble
+        log.warning("the launcher lost a worker (%s)", said)
     return outcomes

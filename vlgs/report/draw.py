@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from vlgs.metrics.dense import predict_classes
@@ -14,8 +14,9 @@ from vlgs.query import Prompts, Query
 from vlgs.report import colors
 from vlgs.report.answer import Answer, Fused, ViewModel, answer_view
 from vlgs.report.features import fit_feature_colors, paint_features
+from vlgs.report.indicator import indicator_difference
 from vlgs.report.labels import read_truth, read_units
-from vlgs.types import IGNORE_ID, Camera, Scene, View
+from vlgs.types import IGNORE_ID, Scene, View
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,9 @@ class Painter:
             pictures = replace(
                 pictures,
                 features=paint_features(answer.feature, self.feature_colors),
-                difference=colors.diverging(self.indicator_difference(view.camera)),
+                difference=colors.diverging(
+                    indicator_difference(self.model, self.fused, view.camera)
+                ),
             )
         if self.prompts is None:
             return pictures
@@ -99,16 +102,6 @@ class Painter:
         prompts = self._answer_prompts(answer, pictures.photograph, units)
         pictures = replace(pictures, prompts=prompts)
         return pictures if truth is None else self._add_classes(pictures, answer, truth)
-
-    def indicator_difference(self, camera: Camera) -> Float[Tensor, "h w"]:
-        """Mean of l - o over the Gaussians of each pixel, in [-1, 1]; 0 where there are none.
-
-        Gaussians count by the larger of l and o, so that neither glass (low o) nor glare (low l) is hidden.
-        """
-        language, color = self.fused.language_weight, self.fused.gaussians.opacities
-        values = torch.stack([language - color, torch.ones_like(color)], dim=1)
-        image = self.model.render_values(camera, values, torch.maximum(language, color))
-        return image[..., 0] / image[..., 1].clamp_min(1e-3)
 
     def _choose(self, units: Sequence[Unit], count: int) -> list[Unit]:
         """Prompts that tell most: rarely asked before, then of neither tiny nor view-filling objects, then glass and mirrors."""

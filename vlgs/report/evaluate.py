@@ -1,7 +1,7 @@
 """Scores of a trained scene on its held-out views."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -12,6 +12,7 @@ from vlgs.metrics.mean import mean_of_known
 from vlgs.metrics.protocol import Auto, EvaluationProtocol, tag
 from vlgs.query import Prompts, Query, TextEncoder, encode_prompts
 from vlgs.report.answer import Answer, ViewModel, answer_view
+from vlgs.report.indicator import Histogram
 from vlgs.report.language import DENSE, LERF_OVS, LanguageScores, LanguageTally
 from vlgs.report.splats import SplatAnswers
 from vlgs.types import Scene, View
@@ -41,6 +42,10 @@ class Evaluation:
     """Metric -> why it is not available; faults of the labels stand under ``labels``."""
     failure: str | None = None
     """Why the evaluation failed: a protocol or labels asked for scores, and nothing could be scored."""
+    category_kinds: Mapping[str, str] = field(default_factory=dict)
+    """Kind of each category, where the scene says it: ``translucent_reflective`` or ``other``."""
+    indicator: Mapping[str, Sequence[float]] | None = None
+    """`vlgs.report.indicator.Histogram` of l - o; None where no held-out view has a class for every pixel."""
     queries: Sequence[Mapping[str, str | int | float | bool | None]] = ()
     """Rows of `query_rows`."""
 
@@ -76,6 +81,7 @@ def evaluate(
     prompts, reason = prompts_of(scene, query, text)
     fused, per_view = [level.fuse() for level in models], {}
     tally = splats = None
+    histogram = Histogram(scene.classes, scene.class_kinds)
     if prompts is not None:
         tally = LanguageTally(query, prompts, headline)
         splats = SplatAnswers(models, fused, query, prompts)
@@ -85,6 +91,7 @@ def evaluate(
             for level, shared in zip(models, fused, strict=True)
         ]
         per_view[view.name] = _image_scores(view, answers[0])
+        histogram.add(view, models[0], fused[0])
         if tally is not None and splats is not None:
             tally.add(view, answers, partial(splats.seen_by, view.camera))
     if tally is not None:
@@ -92,7 +99,8 @@ def evaluate(
     else:
         language = LanguageScores(None, None, {}, {}, {"miou": reason, "loc_acc": reason}, {})
     asked = not isinstance(protocol, Auto) or (prompts is not None and _is_labelled(scene))
-    return _conclude(scene, tag(headline, scene.split), per_view, language, asked)
+    evaluation = _conclude(scene, tag(headline, scene.split), per_view, language, asked)
+    return replace(evaluation, indicator=histogram.shares())
 
 
 def _resolve(protocol: EvaluationProtocol | Auto, scene: Scene) -> EvaluationProtocol:
@@ -155,6 +163,7 @@ def _conclude(
         miou=language.miou,
         loc_acc=language.loc_acc,
         per_category=language.per_category,
+        category_kinds={c: k for c, k in scene.class_kinds.items() if c in language.per_category},
         per_view=per_view,
         beside={
             **language.beside,

@@ -17,6 +17,12 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "miou": ("0..1", "mIoU under `protocol`"),
     "loc_acc": ("0..1", "localisation accuracy under `protocol`"),
     "per_category": ("0..1", "category -> IoU under `protocol`"),
+    "category_kinds": ("", "category -> translucent_reflective or other, where the scene says it"),
+    "indicator": (
+        "",
+        "histogram of l - o, averaged over the Gaussians of a pixel of a held-out view: `edges`, and per kind of category the "
+        "share of its pixels in each bin; null where no view has a class for every pixel",
+    ),
     "protocol": ("", "what miou and loc_acc mean: name@version[settings]/split"),
     "miou_<kind>": ("0..1", "mean IoU of the categories of a kind, e.g. translucent_reflective"),
     "miou_dense": ("0..1", "argmax over all classes, pixels of all held-out views together"),
@@ -97,6 +103,8 @@ def write_metrics(path: Path, evaluation: Evaluation, extra: Mapping[str, Any]) 
     }
     details = {
         "per_category": dict(evaluation.per_category),
+        "category_kinds": dict(evaluation.category_kinds),
+        "indicator": evaluation.indicator,
         "per_view": {name: dict(values) for name, values in evaluation.per_view.items()},
         "reasons": dict(evaluation.reasons),
     }

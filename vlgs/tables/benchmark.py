@@ -7,16 +7,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from vlgs.config import CONF, RESULTS_VERSION, Identity, check_targets, identity
+from vlgs.config import (
+    CONF,
+    NOT_PART_OF_A_RUN,
+    PLACES,
+    RESULTS_VERSION,
+    Identity,
+    check_targets,
+    identity,
+)
 from vlgs.files import write_atomically
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """On what the rows of a table are run: `results/<name>/benchmark.yaml`, written once and committed with the tables."""
+    """On what the rows of a table are run: `results/<name>/benchmark.yaml`, committed with the tables."""
 
     name: str
     """Folder of the tables below `results`."""
@@ -35,19 +43,43 @@ class Benchmark:
         if not self.name or Path(self.name).name != self.name:
             raise ValueError(f"ablate: name must be a folder's name, got {self.name!r}")
 
-    def write(self, path: Path) -> None:
-        """Say in a file what the tables beside it were run on; folders of this machine stay out of it."""
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """The overrides that can move a number: without folders of this machine, threads, pictures and the like."""
+        return tuple(o for o in self.overrides if _moves(o))
+
+    def extend(self, path: Path) -> "Benchmark":
+        """Say in a file what the tables beside it are run on, or add scenes and seeds to what it says.
+
+        Returns:
+            What the file says now.
+
+        Raises:
+            ValueError: If the tables beside it are run on something else.
+        """
+        merged = Benchmark(self.name, self.recorded, self.scenes, self.seeds)
+        if path.is_file():
+            there = Benchmark.read(path)
+            if there.overrides != merged.overrides:
+                raise ValueError(
+                    f"ablate: name must be new for other overrides, got name={self.name}, whose tables are run with "
+                    f"{' '.join(there.overrides)}, not {' '.join(merged.overrides)} ({path})"
+                )
+            scenes = tuple(dict.fromkeys((*there.scenes, *merged.scenes)))
+            seeds = tuple(sorted({*there.seeds, *merged.seeds}))
+            merged = Benchmark(self.name, merged.overrides, scenes, seeds)
         content = {
-            "overrides": [o for o in self.overrides if not _is_a_place(o)],
-            "scenes": list(self.scenes),
-            "seeds": list(self.seeds),
+            "overrides": list(merged.overrides),
+            "scenes": list(merged.scenes),
+            "seeds": list(merged.seeds),
         }
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
+        write_atomically(path, yaml.safe_dump(content, sort_keys=False).encode())
+        return merged
 
     @classmethod
     def read(cls, path: Path) -> "Benchmark":
-        """The inverse of `write`, places apart.
+        """The inverse of `extend`.
 
         Raises:
             ValueError: Names the file and what it must hold.
@@ -91,8 +123,13 @@ class Composer:
         return Identity(**self._known[key], seed=seed)
 
     def takes_scenes(self) -> bool:
-        """Whether the data set holds several scenes (`data.scene`)."""
-        return "scene" in _compose(list(self.benchmark.overrides)).data
+        """Whether a run is told its scene (`data.scene`), or `data.root` is the scene."""
+        data = _compose(list(self.benchmark.overrides)).data
+        if "scene" not in data:
+            return False
+        if OmegaConf.is_missing(data, "scene") or data.scene is not None:
+            return True
+        return self.benchmark.scenes != (Path(data.root).resolve().name,)
 
     def save(self) -> None:
         """Keep what was composed for the next time."""
@@ -132,6 +169,10 @@ def _compose(overrides: list[str]) -> DictConfig:
     return config
 
 
-def _is_a_place(override: str) -> bool:
-    key = override.partition("=")[0].lstrip("+")
-    return key in {"data.root", "data.labels", "data.features", "data.vocabulary", "results"}
+def _moves(override: str) -> bool:
+    """Whether an override can move a number."""
+    key = override.partition("=")[0].lstrip("+~")
+    top, _, inner = key.partition(".")
+    if top == "data":
+        return inner not in PLACES
+    return top not in NOT_PART_OF_A_RUN

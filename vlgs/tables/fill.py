@@ -1,7 +1,8 @@
 """From runs to the numbers of one table: mean and deviation over seeds beside the paper's value."""
 
 import math
-from collections.abc import Iterator, Sequence
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -25,6 +26,10 @@ CELL_COLUMNS = (
 )
 
 
+MEAN = "mean of "
+"""Before the kind, in the column of the mean over the categories of a kind."""
+
+
 @dataclass(frozen=True)
 class Filled:
     """A table with its numbers."""
@@ -32,13 +37,17 @@ class Filled:
     table: Table
     benchmark: Benchmark
     columns: tuple[str, ...]
-    """Scenes and ``avg``, or categories."""
+    """Scenes and ``avg``; or categories, each kind followed by its mean."""
+    kinds: Mapping[str, str]
+    """Category column -> kind; empty for a table by scene."""
+    recipes: Mapping[int, str]
+    """Row -> recipe of its runs, for rows that can be run."""
     same_scenes: bool
     """Whether the scenes are the paper's, so that its values can be set against ours."""
     cells: pd.DataFrame
     """`CELL_COLUMNS`, in printed units; no value is NaN. ``std`` is over seeds, with n - 1."""
     values: pd.DataFrame
-    """Every single number behind the cells: row, column, metric, seed, value."""
+    """Every single number behind the cells: row, column, kind, metric, seed, value."""
     runs: pd.DataFrame
     """The runs behind the cells, one line each: config_hash, protocol, commit, cpu, results_version."""
 
@@ -55,22 +64,31 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
     Raises:
         ValueError: If a row names an option that does not exist.
     """
-    values, hashes = [], set()
+    entries = {QUANTITIES[name].entry for name in table.metrics}
+    frame = frame[frame["metric"].isin({"per_category"} if table.by_category else entries)]
+    values, hashes, recipes = [], set[str](), dict[int, str]()
     for index, row in enumerate(table.rows):
         if row.overrides is None:
             continue
+        recipes[index] = composer.identity(row.overrides, benchmark.seeds[0]).recipe
         found = _runs_of(row, benchmark, composer, frame)
         hashes |= set(found["config_hash"])
         values.append(_values(index, table, found, several=len(benchmark.scenes) > 1))
     long = pd.concat(values) if values else _values(0, table, frame.iloc[:0], several=False)
-    columns = _columns(table, benchmark, long)
-    if not table.by_category:
+    if table.by_category:
+        long = pd.concat([long, _kind_means(long)])
+        columns = _category_columns(table, long)
+    else:
         long = pd.concat([long, _averages(long, benchmark.scenes)])
+        several = len(benchmark.scenes) > 1
+        columns = dict.fromkeys((*benchmark.scenes, AVERAGE) if several else benchmark.scenes, "")
     dataset = dict(map(split_override, benchmark.overrides)).get("data", "synthetic")
     same = dataset == table.dataset and set(benchmark.scenes) <= set(table.scenes.values())
-    cells = pd.DataFrame(_cells(table, columns, long, same), columns=pd.Index(CELL_COLUMNS))
+    cells = pd.DataFrame(_cells(table, tuple(columns), long, same), columns=pd.Index(CELL_COLUMNS))
     runs = frame[frame["config_hash"].isin(hashes)].drop_duplicates("config_hash")
-    return Filled(table, benchmark, columns, same, cells, long.reset_index(drop=True), runs)
+    kinds = {c: k for c, k in columns.items() if k}
+    long = long.reset_index(drop=True)
+    return Filled(table, benchmark, tuple(columns), kinds, recipes, same, cells, long, runs)
 
 
 def _runs_of(
@@ -91,25 +109,53 @@ def _values(index: int, table: Table, found: pd.DataFrame, several: bool) -> pd.
     parts = []
     for name in table.metrics:
         quantity = QUANTITIES[name]
-        entry = "per_category" if table.by_category else quantity.entry
-        rows = found[found["metric"] == entry]
-        part = pd.DataFrame(
-            {
-                "row": index,
-                "column": _column_names(rows, table, several),
-                "metric": name,
-                "seed": rows["seed"],
-                "value": rows["value"] * quantity.factor,
-            }
-        )
-        parts.append(part)
-    return pd.concat(parts)
+        rows = found[found["metric"] == ("per_category" if table.by_category else quantity.entry)]
+        column, kind = rows["scene"], rows["kind"]
+        if table.by_category:
+            column = rows["category"]
+            kind = kind.where(kind != "", column.map(printed_name).map(table.kinds).fillna(""))
+            column = rows["scene"] + ": " + column if several else column
+        part = {
+            "row": index,
+            "column": column,
+            "kind": kind,
+            "metric": name,
+            "seed": rows["seed"],
+            "value": rows["value"] * quantity.factor,
+        }
+        parts.append(pd.DataFrame(part).dropna(subset=["value"]))
+    long = pd.concat(parts)
+    only = set(table.kinds.values())
+    return long[long["kind"].isin(only)] if len(only) == 1 else long
 
 
-def _column_names(rows: pd.DataFrame, table: Table, several: bool) -> pd.Series:
-    if not table.by_category:
-        return rows["scene"]
-    return rows["scene"] + ": " + rows["category"] if several else rows["category"]
+def printed_name(category: str) -> str:
+    """A category as the paper spells it.
+
+    Example:
+        >>> printed_name("sake cup")
+        'sake_cup'
+    """
+    return category.replace(" ", "_")
+
+
+def _kind_means(long: pd.DataFrame) -> pd.DataFrame:
+    """Mean over the categories of a kind per seed, where every category has a number; kinds of one category have none."""
+    sizes = long.groupby("kind")["column"].nunique()
+    grouped = long.groupby(["row", "kind", "metric", "seed"])["value"]
+    means = grouped.agg(value="mean", size="count").reset_index()
+    needed = means["kind"].map(sizes)
+    means = means[(means["size"] == needed) & (needed > 1) & (means["kind"] != "")]
+    return means.drop(columns="size").assign(column=lambda part: MEAN + part["kind"])
+
+
+def _category_columns(table: Table, long: pd.DataFrame) -> dict[str, str]:
+    """Category -> kind, kinds together and the mean of each last; the paper's categories where there is no run."""
+    if long.empty:
+        return dict(table.kinds)
+    pairs = set(zip(long["column"], long["kind"], strict=True))
+    ordered = sorted(pairs, key=lambda pair: (pair[1], pair[0].startswith(MEAN), pair[0]))
+    return dict(ordered)
 
 
 def _averages(long: pd.DataFrame, scenes: Sequence[str]) -> pd.DataFrame:
@@ -120,27 +166,22 @@ def _averages(long: pd.DataFrame, scenes: Sequence[str]) -> pd.DataFrame:
     return complete.assign(column=AVERAGE)
 
 
-def _columns(table: Table, benchmark: Benchmark, long: pd.DataFrame) -> tuple[str, ...]:
-    if table.by_category:
-        own = tuple(sorted(set(long["column"])))
-        return own or tuple(table.kinds)
-    return (*benchmark.scenes, AVERAGE) if len(benchmark.scenes) > 1 else benchmark.scenes
-
-
 def _cells(
     table: Table, columns: Sequence[str], long: pd.DataFrame, same: bool
 ) -> Iterator[tuple[object, ...]]:
     names = {scene: paper for paper, scene in table.scenes.items()} | {AVERAGE: AVERAGE}
-    groups = {key: part for key, part in long.groupby(["row", "column", "metric"])["value"]}
+    groups: dict[tuple[int, str, str], list[float]] = {}
+    for *key, value in zip(long["row"], long["column"], long["metric"], long["value"], strict=True):
+        groups.setdefault((key[0], key[1], key[2]), []).append(value)
     for index, row in enumerate(table.rows):
         for column in columns:
             for metric in table.metrics:
-                numbers = groups.get((index, column, metric), pd.Series(dtype=float)).dropna()
-                mean = numbers.mean() if len(numbers) else math.nan
-                std = numbers.std(ddof=1) if len(numbers) > 1 else math.nan
+                numbers = groups.get((index, column, metric), [])
+                mean = statistics.fmean(numbers) if numbers else math.nan
+                std = statistics.stdev(numbers) if len(numbers) > 1 else math.nan
                 paper = math.nan
                 if same:
-                    printed = column if table.by_category else names.get(column, "")
+                    printed = printed_name(column) if table.by_category else names.get(column, "")
                     paper = row.paper.get(printed, {}).get(metric, math.nan)
                 elif column == AVERAGE:
                     paper = row.paper.get(AVERAGE, {}).get(metric, math.nan)

@@ -22,9 +22,9 @@ RUN_COLUMNS = (
 )
 """What is the same in all rows of a run, as in metrics.json."""
 
-COLUMNS = (*RUN_COLUMNS, "cpu", "metric", "category", "value")
+COLUMNS = (*RUN_COLUMNS, "cpu", "metric", "category", "kind", "value")
 
-DETAILS = {"per_category", "per_view", "reasons", "machine"}
+DETAILS = {"per_category", "category_kinds", "indicator", "per_view", "reasons", "machine", "skips"}
 """Entries of metrics.json that are not one value."""
 
 
@@ -57,9 +57,10 @@ def tidy(runs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
         for metric, value in run.items():
             if metric in RUN_COLUMNS or metric in DETAILS or isinstance(value, (str, dict, list)):
                 continue
-            rows.append([*shared, metric, "", value])
+            rows.append([*shared, metric, "", "", value])
+        kinds = run.get("category_kinds") or {}
         for category, value in (run.get("per_category") or {}).items():
-            rows.append([*shared, "per_category", category, value])
+            rows.append([*shared, "per_category", category, kinds.get(category, ""), value])
     frame = pd.DataFrame(rows, columns=list(COLUMNS))
     frame["value"] = pd.to_numeric(frame["value"], errors="coerce")
     frame["scene"] = frame["scene"].astype(str)

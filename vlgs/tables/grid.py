@@ -98,8 +98,7 @@ def _by_category(filled: Filled, cells: Mapping[tuple[int, str, str], Entry]) ->
             (last.mean - first.mean) - (last.paper - first.paper),
             first.digits,
         )
-        lines.append(Line(filled.table.kinds.get(category, ""), category, (), (*entries, gain)))
-    lines.sort(key=lambda line: line.group)
+        lines.append(Line(filled.kinds.get(category, ""), category, (), (*entries, gain)))
     labels = tuple(row.label for row in table.rows)
     columns = tuple((label, metric) for label in (*labels, "Gain"))
     return Grid((), columns, (*labels, "Gain"), tuple(lines), labels)
@@ -150,12 +149,14 @@ def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Lin
 def caption(filled: Filled) -> str:
     """The registry's caption and what the numbers are."""
     seeds = sorted({entry for entry in filled.cells["seeds"] if entry})
-    counts = (
-        "no runs yet"
-        if not seeds
-        else f"{'-'.join(str(s) for s in sorted({min(seeds), max(seeds)}))} seeds"
-    )
-    parts = [filled.table.caption, f"Mean +- standard deviation over {counts}."]
+    if not seeds:
+        said = "No runs yet."
+    elif seeds == [1]:
+        said = "One seed, hence no deviation."
+    else:
+        spread = "-".join(str(s) for s in sorted({seeds[0], seeds[-1]}))
+        said = f"Mean +- standard deviation over {spread} seeds."
+    parts = [filled.table.caption, said]
     if not filled.same_scenes and any(row.paper for row in filled.table.rows):
         parts.append(
             f"Scenes are those of {filled.benchmark.name}, not the paper's ({filled.table.dataset}), whose averages stand "
@@ -164,6 +165,21 @@ def caption(filled: Filled) -> str:
     if any(row.overrides is None for row in filled.table.rows):
         parts.append(f"{MISSING}: method not built, or no run.")
     return " ".join(parts)
+
+
+def provenance(filled: Filled) -> list[str]:
+    """Machine, commit, protocol, seeds and data of the runs behind a table."""
+    runs = filled.runs
+
+    def all_of(column: str) -> str:
+        return ", ".join(sorted({str(v) for v in runs[column].dropna()})) or "--"
+
+    return [
+        f"data: {' '.join(filled.benchmark.overrides)}; scenes {', '.join(filled.benchmark.scenes)}; "
+        f"seeds {', '.join(map(str, filled.benchmark.seeds))}",
+        f"runs: {len(runs)}; protocol {all_of('protocol')}; results version {all_of('results_version')}",
+        f"commit: {all_of('commit')}; machine: {all_of('cpu')}",
+    ]
 
 
 def has_paper(filled: Filled) -> bool:

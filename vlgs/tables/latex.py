@@ -4,7 +4,17 @@ import math
 from collections.abc import Sequence
 
 from vlgs.tables.fill import Filled
-from vlgs.tables.grid import MISSING, Entry, Grid, Line, arrange, caption, has_paper, number
+from vlgs.tables.grid import (
+    MISSING,
+    Entry,
+    Grid,
+    Line,
+    arrange,
+    caption,
+    has_paper,
+    number,
+    provenance,
+)
 
 _SPECIAL = {
     "\\": r"\textbackslash{}",
@@ -48,6 +58,7 @@ def to_latex(filled: Filled) -> str:
     rows = _with_groups(grid, body, grouped)
     return "\n".join(
         [
+            *(f"% {line}" for line in provenance(filled)),
             r"\begin{table}[htbp]",
             r"\centering",
             rf"\caption{{{escape(caption(filled))}}}",

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from vlgs.tables.fill import Filled
-from vlgs.tables.grid import Entry, arrange, caption, has_paper, number
+from vlgs.tables.grid import Entry, arrange, caption, has_paper, number, provenance
 from vlgs.tables.statistics import sentence
 
 
@@ -35,21 +35,6 @@ def to_markdown(filled: Filled) -> str:
         )
         + "\n"
     )
-
-
-def provenance(filled: Filled) -> list[str]:
-    """Machine, commit, protocol, seeds and data of the runs behind a table."""
-    runs = filled.runs
-
-    def all_of(column: str) -> str:
-        return ", ".join(sorted({str(v) for v in runs[column].dropna()})) or "--"
-
-    return [
-        f"data: {' '.join(filled.benchmark.overrides)}; scenes {', '.join(filled.benchmark.scenes)}; "
-        f"seeds {', '.join(map(str, filled.benchmark.seeds))}",
-        f"runs: {len(runs)}; protocol {all_of('protocol')}; results version {all_of('results_version')}",
-        f"commit: {all_of('commit')}; machine: {all_of('cpu')}",
-    ]
 
 
 def to_csv(filled: Filled) -> str:

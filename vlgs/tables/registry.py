@@ -24,6 +24,9 @@ SWEEPS = (
 AVERAGE = "avg"
 """Column of the mean over scenes."""
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""The safe loader in C where PyYAML has it: ten times as fast."""
+
 _TABLE_KEYS = {"label", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
 _ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
@@ -107,7 +110,7 @@ def load_table(path: Path) -> Table:
         ValueError: Names the file, the key and what it must be.
     """
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.load(path.read_text(), _LOADER)
     except yaml.YAMLError as error:
         raise ValueError(f"{path}: must be YAML, got: {error}") from error
     where = str(path)

@@ -43,27 +43,40 @@ def paired_differences(filled: Filled, metric: str) -> list[Difference]:
     """Every row against the full model of its group, or of the table where the group has none."""
     table, values = filled.table, filled.values
     values = values[(values["metric"] == metric) & (values["column"] != AVERAGE)]
+    numbers: dict[int, dict[tuple[str, int], float]] = {}
+    for row, column, seed, value in zip(
+        values["row"], values["column"], values["seed"], values["value"], strict=True
+    ):
+        numbers.setdefault(row, {})[column, seed] = value
     out = []
     for index, row in enumerate(table.rows):
         reference = _full_model(filled, row.group)
-        if reference is None or row.overrides is None or not row.overrides:
+        if reference is None or not row.overrides:
             continue
-        pairs = values[values["row"] == index].merge(
-            values[values["row"] == reference], on=["column", "seed"], suffixes=("", "_full")
-        )
-        pairs = pairs.assign(difference=pairs["value"] - pairs["value_full"]).dropna(
-            subset=["difference"]
-        )
-        if pairs.empty:
+        mine, full = numbers.get(index, {}), numbers.get(reference, {})
+        pairs: dict[str, list[float]] = {}
+        for (column, seed), value in mine.items():
+            if (column, seed) in full:
+                pairs.setdefault(column, []).append(value - full[column, seed])
+        if not pairs:
             continue
-        by_scene = [part["difference"].to_numpy() for _, part in pairs.groupby("column")]
+        by_scene = [np.array(part) for part in pairs.values()]
         low, high = bootstrap_interval(by_scene, seed=index)
         paper = _paper(filled, index, metric) - _paper(filled, reference, metric)
         mean = float(np.mean([part.mean() for part in by_scene]))
         verdict = judge(low, high, paper)
         out.append(
             Difference(
-                index, row.label, row.group, metric, mean, low, high, len(pairs), paper, verdict
+                index,
+                row.label,
+                row.group,
+                metric,
+                mean,
+                low,
+                high,
+                sum(map(len, by_scene)),
+                paper,
+                verdict,
             )
         )
     return out
@@ -81,14 +94,16 @@ def bootstrap_interval(by_scene: Sequence[np.ndarray], seed: int) -> tuple[float
     if sum(len(part) for part in by_scene) < 2:
         return -math.inf, math.inf
     rng = np.random.default_rng(seed)
-    drawn = np.stack(
-        [part[rng.integers(len(part), size=(RESAMPLES, len(by_scene), len(part)))].mean(axis=2)
-         for part in by_scene]
-    )  # fmt: skip
-    # drawn[s, b, k]: mean of a resample of scene s, for the k-th scene that resample b draws.
-    scenes = rng.integers(len(by_scene), size=(RESAMPLES, len(by_scene)))
-    resample, position = np.indices(scenes.shape)
-    means = drawn[scenes, resample, position].mean(axis=1)
+    sizes = np.array([len(part) for part in by_scene])
+    padded = np.zeros((len(by_scene), sizes.max()))
+    for row, part in zip(padded, by_scene, strict=True):
+        row[: len(part)] = part
+    scenes = rng.integers(len(by_scene), size=(RESAMPLES, len(by_scene)))  # [b, k]
+    drawn = sizes[scenes][..., None]  # seeds of the scene that was drawn, [b, k, 1]
+    seeds = (rng.random((*scenes.shape, sizes.max())) * drawn).astype(int)
+    values = padded[scenes[..., None], seeds]
+    values[np.broadcast_to(np.arange(sizes.max()) >= drawn, values.shape)] = 0.0
+    means = (values.sum(axis=2) / drawn[..., 0]).mean(axis=1)
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
     return float(low), float(high)
@@ -140,9 +155,13 @@ def sentence(filled: Filled, metric: str) -> str:
 
     def show(d: Difference) -> str:
         title = f"{d.group.partition(':')[0]} {d.label}".strip()
-        return (
-            f"{title} {d.mean:+.{quantity.digits}f} [{d.low:+.{quantity.digits}f}, {d.high:+.{quantity.digits}f}]"
-            + (f" (paper {d.paper:+.{quantity.digits}f})" if math.isfinite(d.paper) else "")
+        interval = (
+            f"[{d.low:+.{quantity.digits}f}, {d.high:+.{quantity.digits}f}]"
+            if math.isfinite(d.low)
+            else "[one pair, no interval]"
+        )
+        return f"{title} {d.mean:+.{quantity.digits}f} {interval}" + (
+            f" (paper {d.paper:+.{quantity.digits}f})" if math.isfinite(d.paper) else ""
         )
 
     parts = [
@@ -171,11 +190,10 @@ def _full_model(filled: Filled, group: str) -> int | None:
 
 def _ours(filled: Filled, row: int, metric: str) -> float:
     cells = filled.cells
-    column = AVERAGE if AVERAGE in filled.columns else None
-    chosen = cells[(cells["row"] == row) & (cells["metric"] == metric)]
-    if column:
-        chosen = chosen[chosen["column"] == column]
-    return float(chosen["mean"].mean(skipna=False)) if len(chosen) else math.nan
+    chosen = cells["mean"][(cells["row"] == row) & (cells["metric"] == metric)]
+    if AVERAGE in filled.columns:
+        chosen = chosen[cells["column"] == AVERAGE]
+    return float(chosen.mean(skipna=False)) if len(chosen) else math.nan
 
 
 def _paper(filled: Filled, row: int, metric: str) -> float:

@@ -14,6 +14,10 @@ What each scene tests.
 * ``lookalikes``: eight different things of one red. Colour does not tell classes apart.
 * ``patchwork``: things of many colours each. Colour tells apart what is one.
 
+The ablation tables use ``difficulty=hard`` with ``trainer=benchmark``: there the model without the paper's three ideas (``fusion=none
+indicator=opacity blend=none``) scores an mIoU of 0.62 to 0.74, which leaves room in both directions; on ``easy`` it scores 0.87 to 0.89
+with 700 iterations, and rows can hardly differ.
+
 ``hard`` adds things, so that they hide each other and some come twice, and about doubles the faults. Every pixel has a class;
 table, wall and floor are classes too, but only what stands on the table is asked for in object labels. Categories are
 ``translucent_reflective`` or ``other``. Read as a segmentation, the whole-object supervision of the training views has an

@@ -1,0 +1,269 @@
+"""The runner with runs that only pretend: what is run, tried again, given up, stopped and written."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import ablate_fakes
+import pytest
+
+from vlgs.ablate import __main__ as runner
+from vlgs.ablate import job
+from vlgs.ablate.__main__ import Request, ablate, read
+from vlgs.ablate.job import Outcome, read_outcome, run_and_record
+from vlgs.ablate.plan import plan
+from vlgs.ablate.progress import Count, count
+from vlgs.runs import STOPPED, UNSCORED
+from vlgs.tables.benchmark import Benchmark
+from vlgs.tables.registry import Table, load_table
+
+
+@pytest.fixture(autouse=True)
+def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job, "RUN", (sys.executable, ablate_fakes.__file__))
+    monkeypatch.setattr(job, "POLL_SECONDS", 0.05)
+    monkeypatch.setattr(runner, "WAIT_SECONDS", 0.1)
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Table:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(ablate_fakes.TABLE)
+    return load_table(path)
+
+
+def request_of(
+    table: Table, results: Path, seeds: tuple[int, ...] = (0,), dry: bool = False
+) -> Request:
+    benchmark = Benchmark("synthetic", ("data=synthetic",), ("glassware",), seeds)
+    results.mkdir(exist_ok=True)
+    return Request([table], benchmark, results, (), dry)
+
+
+def behave(results: Path, **acts: list[str]) -> None:
+    results.mkdir(exist_ok=True)
+    named = {f"{name.rstrip('0123456789')} glassware {name[-1]}": a for name, a in acts.items()}
+    (results / "behave.json").write_text(json.dumps(named))
+
+
+def ran(results: Path) -> list[str]:
+    return (results / "ran.txt").read_text().splitlines()
+
+
+def test_what_is_missing_is_run_once_and_the_tables_are_written(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    assert ablate(request_of(table, results)) == 0
+    assert sorted(ran(results)) == ["none glassware 0", "self glassware 0"]
+    folder = results / "synthetic"
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {
+        "benchmark.yaml",
+        "tiny.csv",
+        "tiny.md",
+        "tiny.tex",
+        "tables.tex",
+        "index.html",
+    }
+    assert "50.0" in (folder / "tiny.md").read_text()
+    assert "2 runs: 2 done" in capsys.readouterr().out
+    assert ablate(request_of(table, results)) == 0
+    assert len(ran(results)) == 2
+    assert ablate(request_of(table, results, seeds=(0, 1))) == 0  # extends
+    assert len(ran(results)) == 4
+    assert Benchmark.read(folder / "benchmark.yaml").seeds == (0, 1)
+
+
+def test_a_failure_is_shown_with_its_log_and_the_others_go_on(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    behave(results, none0=["error"])
+    assert ablate(request_of(table, results)) == 1
+    out = capsys.readouterr().out
+    assert "exit status 1" in out
+    assert "error: fake: scene must be good, got bad" in out
+    log = Path(out.partition("log: ")[2].split("\n")[0])
+    assert "fusion=none" in log.read_text()
+    assert sorted(ran(results)) == ["none glassware 0", "self glassware 0"]
+    assert "--" in (results / "synthetic" / "tiny.md").read_text()
+
+
+def test_a_killed_run_is_tried_again_but_not_for_ever(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    behave(results, none0=["kill", "ok"], self0=["kill"] * 9)
+    assert ablate(request_of(table, results)) == 1
+    assert ran(results).count("none glassware 0") == 2
+    assert ran(results).count("self glassware 0") == runner.TRIES
+    assert "killed by signal 9 (out of memory?)" in capsys.readouterr().out
+
+
+def test_runs_of_another_process_are_waited_for(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    behave(results, none0=["busy", "busy"], self0=["busy"])
+    assert ablate(request_of(table, results)) == 0
+    assert "waiting for another process" in capsys.readouterr().out
+
+
+def test_results_of_another_row_end_the_waiting(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    behave(results, none0=["other"])
+    assert ablate(request_of(table, results)) == 1
+    assert "its results are not those of this row" in capsys.readouterr().out
+    assert ran(results).count("none glassware 0") == 1
+
+
+def test_ctrl_c_lets_the_runs_save_and_the_same_command_goes_on(table: Table, tmp_path: Path):
+    results = tmp_path / "r"
+    behave(results, none0=["wait"])
+
+    def press() -> None:
+        while not (results / "waiting").exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=press)
+    thread.start()
+    assert ablate(request_of(table, results)) == STOPPED
+    thread.join()
+    assert ran(results) == ["none glassware 0"]  # the next one was not begun
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    (outcome,) = [
+        read_outcome(folder, 0) for folder in (results / "logs").iterdir() if folder.is_dir()
+    ]
+    assert outcome.status == STOPPED  # it was told, and saved
+    assert ablate(request_of(table, results)) == 0
+
+
+def test_a_stop_reaches_jobs_that_have_not_begun(tmp_path: Path):
+    (tmp_path / job.STOP).touch()
+    run_and_record(tmp_path, 3, ["fusion=none"])
+    assert read_outcome(tmp_path, 3).status == STOPPED
+    assert not list(tmp_path.glob("*.log"))
+
+
+def test_dry_says_what_would_run_and_writes_nothing(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    assert ablate(request_of(table, results, dry=True)) == 0
+    out = capsys.readouterr().out
+    assert "python -m vlgs.run data=synthetic fusion=none data.scene=glassware seed=0" in out
+    assert not any(results.iterdir())
+
+
+def test_a_benchmark_extends_or_refuses(tmp_path: Path):
+    path = tmp_path / "b" / "benchmark.yaml"
+    first = Benchmark("b", ("data=synthetic", "threads=1", "data.root=/x"), ("glassware",), (0, 1))
+    first.extend(path)
+    assert Benchmark.read(path) == Benchmark("b", ("data=synthetic",), ("glassware",), (0, 1))
+    second = Benchmark("b", ("data=synthetic", "threads=2"), ("mirrors",), (4,))
+    assert second.extend(path).scenes == ("glassware", "mirrors")
+    assert Benchmark.read(path).seeds == (0, 1, 4)
+    before = path.read_text()
+    with pytest.raises(
+        ValueError, match=r"name must be new for other overrides, got name=b, .*trainer=smoke"
+    ):
+        Benchmark("b", ("data=synthetic", "trainer=smoke"), ("glassware",), (0,)).extend(path)
+    assert path.read_text() == before
+
+
+def test_rows_that_are_one_run_are_planned_once(table: Table):
+    benchmark = Benchmark("b", ("data=synthetic",), ("glassware", "mirrors"), (0, 1))
+    planned = plan([table, table], benchmark)
+    assert len(planned) == len({run.key for run in planned}) == 2 * 2 * 2
+    assert [run.identity.seed for run in planned] == [0] * 4 + [1] * 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["scenes=a"], "tab must be given"),
+        (["tab=ab-multi", "fast"], "arguments must be KEY=VALUE, got fast"),
+        (["tab=ab-mutli"], "tab: must be all or one of"),
+        (["tab=ab-multi", "seeds=many"], "seeds must be a count or a list of integers, got many"),
+        (["tab=ab-multi", "seeds=0"], "seeds must be given, each once, got none"),
+        (["tab=ab-multi", "seed=3"], "seeds must be given as seeds=, got seed=3"),
+        (["tab=ab-multi", "scenes=a,a"], "scenes must be given, each once, got a, a"),
+        (["tab=ab-multi", "name=a/b"], "name must be a folder's name, got 'a/b'"),
+        (["tab=ab-multi", "data=colmap"], "data.root must be given with data=colmap"),
+        (["tab=ab-multi", "dry=maybe"], "dry must be true or false, got maybe"),
+    ],
+)
+def test_a_slip_on_the_command_line_is_named(arguments: list[str], message: str):
+    with pytest.raises(ValueError, match=message):
+        read(arguments)
+
+
+def test_an_unknown_launcher_is_one_error(table: Table, tmp_path: Path):
+    request = request_of(table, tmp_path / "r")
+    slip = Request([table], request.benchmark, request.results, ("hydra/launcher=jolib",), False)
+    with pytest.raises(ValueError, match="hydra/launcher must exist and be installed"):
+        ablate(slip)
+
+
+def test_the_command_line_is_split():
+    request = read(
+        [
+            "tab=ab-cam",
+            "data=colmap",
+            "data.root=/a/photos",
+            "seeds=4,7",
+            "hydra/launcher=processes",
+            "threads=1",
+        ]
+    )
+    assert request.benchmark.name == "photos"
+    assert request.benchmark.scenes == ("photos",)
+    assert request.benchmark.seeds == (4, 7)
+    assert request.benchmark.recorded == ("data=colmap",)
+    assert request.launcher == ("hydra/launcher=processes", "threads=1")
+
+
+def test_outcomes_are_told_apart():
+    assert Outcome(0).done
+    assert Outcome(UNSCORED).done
+    assert Outcome(None, 0.0, "x").lost
+    assert Outcome(-9).lost
+    assert Outcome(STOPPED).lost  # by someone else: a queue that wants its machine back
+    assert not Outcome(1).lost
+    assert Outcome().reason() == "it was never started"
+
+
+def test_progress_counts_and_estimates():
+    before = Count(total=10, done=3, failed=1, seconds_per_run=100.0)
+    jobs = [Outcome(0, 30.0, "a"), Outcome(0, 50.0, "b"), Outcome(1, 5.0, "c"), Outcome(75, 5.0, "d"),
+            Outcome(None, 10.0, "e"), Outcome(None, 10.0, "f"), Outcome()]  # fmt: skip
+    now = count(before, jobs)
+    assert (now.done, now.running, now.failed, now.remaining) == (5, 2, 2, 3)
+    assert now.seconds_per_run == 40.0
+    # Three remain, two of them half done: two runs' work on two workers.
+    assert now.line().endswith("3 remaining, about 40 s left")
+    assert "left" not in Count(total=2, done=0).line()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "scenes", "told"),
+    [
+        (("data=synthetic",), ("mirrors",), True),
+        (("data=colmap", "data.root=/a/photos"), ("photos",), False),
+        (("data=colmap", "data.root=/a"), ("one", "two"), True),
+        (("data=lerf_ovs", "data.root=/a"), ("ramen",), True),
+    ],
+)
+def test_a_run_is_told_its_scene_unless_the_folder_is_the_scene(
+    overrides: tuple[str, ...], scenes: tuple[str, ...], told: bool, table: Table
+):
+    runs = plan([table], Benchmark("b", overrides, scenes, (0,)))
+    assert {any(o.startswith("data.scene=") for o in run.overrides) for run in runs} == {told}

@@ -1,0 +1,133 @@
+"""One page per benchmark: every table with what it says and a plot, then the runs behind them."""
+
+import json
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from jinja2 import Environment
+
+from vlgs.files import write_atomically
+from vlgs.tables import plots
+from vlgs.tables.fill import Filled
+from vlgs.tables.grid import arrange, caption, has_paper, number, provenance
+from vlgs.tables.statistics import sentence
+
+
+def write_report(
+    folder: Path, filled: Sequence[Filled], frame: pd.DataFrame, results: Path
+) -> None:
+    """Write index.html and its pictures (plots/*.png).
+
+    Args:
+        folder: Of the benchmark.
+        filled: Its tables that have runs.
+        frame: As `vlgs.tables.frame.tidy` returns it.
+        results: Where the runs lie.
+    """
+    pictures = folder / "plots"
+    pictures.mkdir(exist_ok=True)
+
+    def keep(name: str, png: bytes | None) -> str:
+        if png is None:
+            return ""
+        write_atomically(pictures / f"{name}.png", png)
+        return f"plots/{name}.png"
+
+    hashes = {h for table in filled for h in table.runs["config_hash"]}
+    mine = frame[frame["config_hash"].isin(hashes)]
+    full = _full_model(filled)
+    whole = [
+        ("Training time against mIoU", "time", plots.time_against_score(mine, _titles(filled))),
+        (
+            "Learning curves of the full model",
+            "curves",
+            plots.learning_curves(_curves(full, results)),
+        ),
+        (
+            "Indicator minus opacity in the full model, by kind of category",
+            "indicator",
+            plots.indicator_by_kind(_histograms(full, results)),
+        ),
+    ]
+    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
+        resources.files("vlgs.tables").joinpath("report.html.j2").read_text()
+    )
+    text = page.render(
+        name=folder.name,
+        tables=[_section(table, keep(table.table.label, plots.bars(table))) for table in filled],
+        whole=[(title, keep(name, png)) for title, name, png in whole if png is not None],
+        provenance=provenance(filled[0]) if filled else [],
+    )
+    write_atomically(folder / "index.html", text.encode())
+
+
+def _section(filled: Filled, picture: str) -> dict[str, Any]:
+    grid, paper = arrange(filled), has_paper(filled)
+    by_category = filled.table.by_category
+    return {
+        "label": filled.table.label,
+        "caption": caption(filled),
+        "head": ["", *grid.mark_names, *grid.headers],
+        "lines": [
+            {
+                "group": line.group,
+                "label": line.label,
+                "marks": ["✓" if mark else "" for mark in line.marks]
+                + [""] * (len(grid.mark_names) - len(line.marks)),
+                "entries": [
+                    {
+                        "text": entry.text,
+                        "std": number(entry.std, entry.digits) if entry.std == entry.std else "",
+                        "rank": entry.rank,
+                        "paper": number(entry.paper, entry.digits)
+                        if paper and entry.paper == entry.paper
+                        else "",
+                    }
+                    for entry in line.entries
+                ],
+            }
+            for line in grid.lines
+        ],
+        "said": [] if by_category else [sentence(filled, m) for m in filled.table.metrics],
+        "picture": picture,
+    }
+
+
+def _titles(filled: Sequence[Filled]) -> dict[str, str]:
+    """Recipe -> the first row that runs it."""
+    titles: dict[str, str] = {}
+    for table in filled:
+        for index, recipe in table.recipes.items():
+            row = table.table.rows[index]
+            titles.setdefault(recipe, "full model" if row.overrides == () else row.label)
+    return titles
+
+
+def _full_model(filled: Sequence[Filled]) -> pd.DataFrame:
+    """Runs of the configuration without overrides."""
+    for table in filled:
+        for index, recipe in table.recipes.items():
+            if table.table.rows[index].overrides == ():
+                return table.runs[table.runs["recipe"] == recipe].sort_values(["scene", "seed"])
+    return pd.DataFrame(columns=["config_hash", "scene"])
+
+
+def _curves(runs: pd.DataFrame, results: Path) -> dict[str, list[pd.DataFrame]]:
+    curves: dict[str, list[pd.DataFrame]] = {}
+    for config_hash, scene in zip(runs["config_hash"], runs["scene"], strict=True):
+        path = results / "runs" / config_hash / "log.csv"
+        if path.is_file():
+            curves.setdefault(scene, []).append(pd.read_csv(path))
+    return curves
+
+
+def _histograms(runs: pd.DataFrame, results: Path) -> list[dict[str, list[float]]]:
+    found = []
+    for config_hash in runs["config_hash"]:
+        metrics = json.loads((results / "runs" / config_hash / "metrics.json").read_text())
+        if metrics.get("indicator"):
+            found.append(metrics["indicator"])
+    return found

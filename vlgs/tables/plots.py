@@ -1,0 +1,170 @@
+"""Pictures of the report: a bar chart per table, run time against mIoU, learning curves, l - o by kind. Matplotlib, no display."""
+
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import pandas as pd
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vlgs.tables.fill import Filled
+from vlgs.tables.grid import Line, arrange
+from vlgs.tables.quantities import QUANTITIES
+from vlgs.tables.registry import AVERAGE
+
+STYLE: Mapping[Any, Any] = {
+    "font.size": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "legend.frameon": False,
+}
+COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+"""Told apart by colour-blind eyes too (Tol's bright scheme)."""
+
+
+def bars(filled: Filled) -> bytes | None:
+    """First metric of every row, with the deviation over seeds; by scene tables show their average, or their only scene.
+
+    Returns:
+        A PNG file, or None where no row has a number.
+    """
+    grid = arrange(filled)
+    last = len(grid.columns) - 1 if filled.table.by_category else 0
+    metric = filled.table.metrics[0]
+    chosen = [
+        i for i, (column, name) in enumerate(grid.columns) if column == AVERAGE and name == metric
+    ]
+    series = list(range(last)) if filled.table.by_category else chosen or [0]
+    lines = [
+        line for line in grid.lines if any(math.isfinite(line.entries[i].mean) for i in series)
+    ]
+    if not lines:
+        return None
+    with _png(6.4, 0.6 + 0.16 * len(lines) * max(len(series), 1.6)) as (axes, file):
+        _draw_bars(axes, lines, series, grid.headers)
+        quantity = QUANTITIES[metric]
+        axes.set_xlabel(
+            f"{quantity.header} ({quantity.unit})" if quantity.unit else quantity.header
+        )
+        if len(series) > 1:
+            axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    return file.getvalue()
+
+
+def time_against_score(frame: pd.DataFrame, labels: Mapping[str, str]) -> bytes | None:
+    """Training time against mIoU: one point per recipe, mean over its scenes and seeds.
+
+    Args:
+        frame: As `vlgs.tables.frame.tidy` returns it, of one benchmark.
+        labels: Recipe -> what to call it.
+
+    Returns:
+        A PNG file, or None without runs.
+    """
+    wide = frame[frame["metric"].isin(["miou", "train_seconds"])].pivot_table(
+        index="recipe", columns="metric", values="value", aggfunc="mean"
+    )
+    if wide.empty or not {"miou", "train_seconds"} <= set(wide.columns):
+        return None
+    wide = wide.dropna()
+    with _png(6.4, 4.0) as (axes, file):
+        for index, (recipe, row) in enumerate(wide.iterrows()):
+            color = COLORS[index % len(COLORS)]
+            axes.plot(row["train_seconds"], 100 * row["miou"], "o", color=color, markersize=4)
+            axes.annotate(
+                labels.get(str(recipe), str(recipe)),
+                (row["train_seconds"], 100 * row["miou"]),
+                xytext=(4, 3),
+                textcoords="offset points",
+                fontsize=6,
+            )
+        axes.set_xlabel("training (s)")
+        axes.set_ylabel("mIoU (%)")
+    return file.getvalue()
+
+
+def learning_curves(curves: Mapping[str, Sequence[pd.DataFrame]]) -> bytes | None:
+    """PSNR of the training views over the iterations; one colour per scene, one line per seed.
+
+    Args:
+        curves: Scene -> contents of log.csv, one per seed.
+    """
+    if not any(curves.values()):
+        return None
+    with _png(6.4, 3.0) as (axes, file):
+        for index, (scene, runs) in enumerate(curves.items()):
+            for number, run in enumerate(runs):
+                axes.plot(
+                    run["step"],
+                    run["psnr"],
+                    color=COLORS[index % len(COLORS)],
+                    linewidth=0.8,
+                    label=scene if number == 0 else None,
+                )
+        axes.set_xlabel("iteration")
+        axes.set_ylabel("PSNR of the training views (dB)")
+        axes.legend()
+    return file.getvalue()
+
+
+def indicator_by_kind(histograms: Sequence[Mapping[str, Sequence[float]]]) -> bytes | None:
+    """Share of pixels by l - o, mean over runs; one line per kind of category.
+
+    Args:
+        histograms: The entry ``indicator`` of metrics.json of some runs.
+    """
+    if not histograms:
+        return None
+    kinds = sorted({kind for one in histograms for kind in one if kind != "edges"})
+    edges = histograms[0]["edges"]
+    with _png(6.4, 2.6) as (axes, file):
+        for index, kind in enumerate(kinds):
+            rows = pd.DataFrame([one[kind] for one in histograms if kind in one])
+            name = kind.replace("_", " or ")
+            axes.stairs(rows.mean().to_numpy(), edges, color=COLORS[index], label=name)
+        axes.set_xlabel("l - o")
+        axes.set_ylabel("share of pixels")
+        axes.set_yscale("log")
+        axes.legend()
+    return file.getvalue()
+
+
+@contextmanager
+def _png(width: float, height: float) -> Iterator[tuple[Axes, io.BytesIO]]:
+    file = io.BytesIO()
+    with rc_context(dict(STYLE)):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        yield figure.add_subplot(), file
+        figure.savefig(file, format="png", dpi=110, metadata={"Software": None})
+
+
+def _draw_bars(
+    axes: Axes, lines: Sequence[Line], series: Sequence[int], headers: Sequence[str]
+) -> None:
+    height = 0.8 / len(series)
+    for number, index in enumerate(series):
+        entries = [line.entries[index] for line in lines]
+        axes.barh(
+            [i + (number - (len(series) - 1) / 2) * height for i in range(len(lines))],
+            [entry.mean for entry in entries],
+            height,
+            xerr=[0.0 if math.isnan(entry.std) else entry.std for entry in entries],
+            color=COLORS[number % len(COLORS)],
+            error_kw={"elinewidth": 0.8},
+            label=headers[index],
+        )
+    axes.set_yticks(range(len(lines)), [_title(line) for line in lines])
+    axes.invert_yaxis()
+    means = [line.entries[i].mean for line in lines for i in series]
+    shown = [mean for mean in means if math.isfinite(mean)]
+    if min(shown) > 0 and max(shown) < 2 * min(shown):  # close together: do not start at zero
+        axes.set_xlim(left=min(shown) - 0.5 * (max(shown) - min(shown)) - 0.02 * max(shown))
+
+
+def _title(line: Line) -> str:
+    return f"{line.group.partition(':')[0]}: {line.label}" if line.group else line.label

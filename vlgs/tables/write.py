@@ -1,0 +1,66 @@
+"""From finished runs to the files of the tables."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vlgs.files import write_atomically
+from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.fill import Filled, fill
+from vlgs.tables.frame import read_metrics, require_one_meaning, tidy, write_frame
+from vlgs.tables.latex import document, to_latex
+from vlgs.tables.markdown import to_csv, to_markdown
+from vlgs.tables.registry import Table
+
+
+def write_all(
+    results: Path, tables: Sequence[Table], name: str | None = None, html: bool = False
+) -> list[Path]:
+    """Write the frame of all runs and the tables of every benchmark.
+
+    Args:
+        results: Folder of the runs and of the benchmarks.
+        tables: Which to write; one without a single run is left out.
+        name: Only the tables of this benchmark.
+        html: Write index.html with its plots too, of these tables.
+
+    Returns:
+        The folders that were written.
+
+    Raises:
+        ValueError: If there is no benchmark, or runs that must not stand in one table.
+    """
+    files = sorted(results.glob(f"{name or '*'}/benchmark.yaml"))
+    if not files:
+        raise ValueError(
+            f"tables: {results} must hold a benchmark ({name or '<name>'}/benchmark.yaml, written by python -m vlgs.ablate), "
+            "got none"
+        )
+    frame = tidy(read_metrics(results))
+    require_one_meaning(frame)
+    write_frame(frame, results)
+    for file in files:
+        benchmark = Benchmark.read(file)
+        composer = Composer(benchmark, results / "cache" / "recipes.json")
+        filled = [fill(table, benchmark, composer, frame) for table in tables]
+        composer.save()
+        filled = [table for table in filled if len(table.runs)]
+        write_tables(file.parent, filled)
+        if html:
+            from vlgs.tables.html import (
+                write_report,  # matplotlib, which the tables alone do not wait for
+            )
+
+            write_report(file.parent, filled, frame, results)
+    return [file.parent for file in files]
+
+
+def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
+    """Each table as csv, Markdown and LaTeX, and one document over all tables of the folder."""
+    for table in filled:
+        stem = folder / table.table.label
+        write_atomically(stem.with_suffix(".csv"), to_csv(table).encode())
+        write_atomically(stem.with_suffix(".md"), to_markdown(table).encode())
+        write_atomically(stem.with_suffix(".tex"), to_latex(table).encode())
+    labels = sorted(path.stem for path in folder.glob("*.tex") if path.stem != "tables")
+    text = document(f"Ablations on {folder.name}", labels)
+    write_atomically(folder / "tables.tex", text.encode())
