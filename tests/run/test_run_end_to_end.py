@@ -12,8 +12,7 @@ from tiny_runs import TINY, composed
 
 from vlgs.report.results import METRICS
 from vlgs.run import run
-from vlgs.runs import UNSCORED
-from vlgs.runs import RunFolder
+from vlgs.runs import UNSCORED, RunFolder
 
 SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30")
 

@@ -73,9 +73,9 @@ class GaussiansConfig:
     the cameras and the scene would otherwise cover whole views."""
     max_count: int = 200_000
     """Sparse points beyond this are left out, and densification stops growing here."""
-    prune_on: Literal["max", "opacity"] = "max"
+    prune_on: Literal["max", "opacity", "indicator"] = "max"
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
-    reading of the paper (systems.md D.10)."""
+    reading of the paper (systems.md D.10); ``indicator`` is for Gaussians of language alone."""
     init: str | None = None
     """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
@@ -91,7 +91,7 @@ class GaussiansConfig:
         _require_at_least("gaussians", 1, init_points=self.init_points, max_count=self.max_count)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
-            "prune_on": ("max", "opacity"),
+            "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
         }.items():
             if getattr(self, name) not in options:

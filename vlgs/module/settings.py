@@ -23,6 +23,10 @@ class LearningRates:
     fusion: float = 1e-3
     """The paper is silent (systems.md D.6)."""
 
+    def of(self, parameter: str) -> float:
+        """Rate of a parameter of the Gaussians; language's own shape is learned like colour's."""
+        return getattr(self, parameter.removeprefix("language_"))
+
 
 @dataclass(frozen=True)
 class SkipConfig:

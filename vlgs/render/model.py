@@ -49,7 +49,7 @@ class SplatModel(nn.Module):
     """What a checkpoint holds and an evaluation needs.
 
     Args:
-        parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`.
+        parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`, with or without `LANGUAGE_SHAPE`.
         fusion: Mixes colour and language of each Gaussian (Eq. attention).
         indicator: Chooses what blends language (Eq. lancity).
         codec: Embedding to language code and back.
@@ -130,7 +130,8 @@ class SplatModel(nn.Module):
         if color:
             groups.append(ChannelGroup(self.view_color(fused, camera), fused.gaussians.opacities))
         if language:
-            groups.append(ChannelGroup(fused.feature, fused.language_weight))
+            shape = fused.gaussians.language_shape
+            groups.append(ChannelGroup(fused.feature, fused.language_weight, shape=shape))
         out = self._rasterize(fused.gaussians, groups, camera)
         return ViewRender(
             color=out.images[0] if color else None,
@@ -144,9 +145,10 @@ class SplatModel(nn.Module):
     def render_values(
         self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w c"]:
-        """Blend any per-Gaussian values with any weight, e.g. the l - o map of fig. lancity-vis."""
+        """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of fig. lancity-vis."""
         gaussians = self.gaussians()
-        return self._rasterize(gaussians, [ChannelGroup(values, weight)], camera).images[0]
+        group = ChannelGroup(values, weight, shape=gaussians.language_shape)
+        return self._rasterize(gaussians, [group], camera).images[0]
 
     def view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
         """RGB of every Gaussian as a camera sees it, >= 0."""
