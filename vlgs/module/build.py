@@ -59,7 +59,8 @@ def build_module(scene: Scene, parts: Parts, seed: int, color: bool = True) -> V
         parameters = initialise(scene, config, codec.dim, seed)
     else:
         parameters = start_from(config.init, config, codec.dim)
-    own = not parts.sharing.covariances and scene.mask_vectors.shape[0] > 0
+    language = scene.mask_vectors.shape[0] > 0
+    own = language and parts.sharing.means and not parts.sharing.covariances
     parameters = with_language_shape(parameters, own)
     model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, sh_degree=0)
     return VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
