@@ -13,6 +13,7 @@ from vlgs.gaussians.parameters import with_language_shape
 from vlgs.indicator import Indicator
 from vlgs.interchange import load_weights, start_from
 from vlgs.losses import Losses
+from vlgs.module.lift import lift_features
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import TrainerConfig
 from vlgs.render.model import SplatModel
@@ -62,5 +63,9 @@ def build_module(scene: Scene, parts: Parts, seed: int, color: bool = True) -> V
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.means and not parts.sharing.covariances
     parameters = with_language_shape(parameters, own)
-    model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, sh_degree=0)
-    return VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
+    evaluated = config.color == "evaluated"
+    model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, 0, evaluated)
+    module = VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
+    if config.init_features == "lifted":
+        lift_features(module)
+    return module

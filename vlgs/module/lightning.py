@@ -17,7 +17,7 @@ from vlgs.geometry import scene_extent
 from vlgs.losses import Losses, view_similarity
 from vlgs.module.blended import BlendPlan, plan_blend
 from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
-from vlgs.module.sampler import PairSampler
+from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.settings import TrainerConfig
 from vlgs.module.skips import SkipCount
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
@@ -94,7 +94,10 @@ class VLGSModule(L.LightningModule):
         self.seed = seed
         self.color = color
         sizes = tuple((view.camera.width, view.camera.height) for view in scene.train)
-        self.sampler = PairSampler(sizes, seed)
+        near = None
+        if blend.pairs == "neighbours":
+            near = nearest_views([view.camera for view in scene.train], blend.neighbours)
+        self.sampler = PairSampler(sizes, seed, near)
         self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
@@ -109,7 +112,8 @@ class VLGSModule(L.LightningModule):
         self.skips = SkipCount()
         self.frozen = None
         geometry = GEOMETRY & set(model.splats)
-        if color and trainer_config.skip.frozen_weights and set(trainer_config.freeze) >= geometry:
+        keeps = trainer_config.skip.frozen_weights and color and not model.evaluated
+        if keeps and set(trainer_config.freeze) >= geometry:
             self.frozen = FrozenRenders(model, trainer_config.skip.frozen_budget, self.skips)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:

@@ -35,7 +35,7 @@ def for_language(parts: Parts) -> Parts:
     config = parts.gaussians
     config = replace(
         config,
-        sh_degree=0,
+        color="rgb",
         prune_on="indicator",
         densify_on="total",
         densify=replace(config.densify, reset_indicator=True),
