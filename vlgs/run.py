@@ -39,6 +39,11 @@ def main(config: DictConfig) -> None:
             raise
         print(f"error: {error}", file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
+    except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
+        if not alone:
+            raise
+        print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(STOPPED)
     if status:
         sys.exit(status)
 
@@ -57,10 +62,9 @@ def run(config: DictConfig) -> int:
     torch.set_num_threads(config.threads)
     scenes = _scenes(config)
     given = {key: config[group].get(key) for group, key in GIVEN_FILES}
-    read = [
-        *(scene.fingerprint for scene in scenes.values()),
-        instantiate(config.augment).identity(),
-    ]
+    augment = instantiate(config.augment)
+    augment.require(scenes)
+    read = [*(scene.fingerprint for scene in scenes.values()), augment.identity()]
     read += [file_digest(path, key) for key, path in given.items() if path]
     content = " ".join(filter(None, read))
     folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
@@ -166,12 +170,9 @@ def _report(
     from vlgs.report.timing import measure_fps
 
     model, scene = models[-1], next(reversed(scenes.values()))
-    query, protocol, done = (
-        instantiate(config.query),
-        instantiate(config.protocol),
-        stages.done.values(),
-    )
-    for stage in done:
+    query, protocol = instantiate(config.query), instantiate(config.protocol)
+    done, kept = stages.done.values(), stages.kept
+    for stage in kept:
         write_ply(stage.folder.ply, stage.model.splats)
     evaluation = evaluate(models, scene, query, text, protocol)
     prompts, _ = prompts_of(scene, query, text)
@@ -179,13 +180,15 @@ def _report(
     if config.pictures:
         write_pictures(folder.renders, model, scene, query, prompts)
     extra = {
-        "n_gaussians": sum(model.count for model in models),
-        "levels": list(scenes) if len(scene.mask_vectors) else [],
+        "n_gaussians": sum(stage.model.count for stage in kept),
+        "levels": [level for level in scenes if level is not None]
+        if len(scene.mask_vectors)
+        else [],
         "train_seconds": sum(stage.seconds for stage in done),
         "skips": all_skips(done).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "ply_bytes": sum(stage.folder.ply.stat().st_size for stage in done),
-        "checkpoint_bytes": sum(_checkpoint_bytes(stage.folder) for stage in done),
+        "ply_bytes": sum(stage.folder.ply.stat().st_size for stage in kept),
+        "checkpoint_bytes": sum(_checkpoint_bytes(stage.folder) for stage in kept),
         "seed": config.seed,
         "config_hash": folder.path.name,
         "recipe": identity(config).recipe,

@@ -1,6 +1,7 @@
 """augment=offline: what is added to the training views."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,9 +27,9 @@ def model(tiny_scene: Scene) -> SplatModel:
 
 
 def test_added_views_look_from_between_with_masks_of_their_own(
-    tiny_scene: Scene, model: SplatModel
+    tiny_scene: Scene, model: SplatModel, tmp_path: Path
 ):
-    extended = Offline(views=5).extend({3: tiny_scene}, model, seed=0)[3]
+    extended = Offline(views=5).extend({3: tiny_scene}, model, 0, tmp_path)[3]
     assert extended.train[:6] == tiny_scene.train
     assert extended.test == tiny_scene.test
     added = extended.train[6:]
@@ -59,9 +60,11 @@ def test_added_views_look_from_between_with_masks_of_their_own(
     )
 
 
-def test_added_views_are_a_function_of_the_seed(tiny_scene: Scene, model: SplatModel):
+def test_added_views_are_a_function_of_the_seed(
+    tiny_scene: Scene, model: SplatModel, tmp_path: Path
+):
     def masks(seed: int) -> torch.Tensor:
-        scene = Offline(views=2).extend({3: tiny_scene}, model, seed)[3]
+        scene = Offline(views=2).extend({3: tiny_scene}, model, seed, tmp_path)[3]
         read = scene.train[-1].read_masks
         assert read is not None
         return read()
@@ -105,12 +108,14 @@ class Halves:
 
 
 def test_an_extractor_describes_the_rendered_images_once_for_all_levels(
-    tiny_scene: Scene, model: SplatModel
+    tiny_scene: Scene, model: SplatModel, tmp_path: Path
 ):
     photographs, halves = replace(tiny_scene, supervise=None), Halves()
     augment = Offline(views=2, extractor=halves)
     assert augment.identity() == "[('halves', '1')]"
-    extended = augment.extend({2: photographs, 3: photographs}, model, seed=0)
+    both = {2: photographs, 3: photographs}
+    augment.extend(both, model, 0, tmp_path / "maps")
+    extended = augment.extend(both, model, 0, tmp_path / "maps")  # taken up again
     assert halves.asked == ["extra_00001", "extra_00002"]
     offset = len(tiny_scene.mask_vectors)
     read = extended[3].train[-1].read_masks

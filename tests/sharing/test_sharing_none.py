@@ -48,11 +48,14 @@ def test_the_united_model_renders_what_each_set_does(
     both = unite(color.model, language.model)
     camera = tiny_scene.test[0].camera
     got = both.render(camera)
-    assert torch.equal(got.color, color.model.render(camera, language=False).color)
-    want = language.model.render(camera, color=False).feature
-    assert want is not None
-    assert want.abs().max() > 0
-    torch.testing.assert_close(got.feature, want, rtol=0, atol=1e-6)
+    image = color.model.render(camera, language=False).color
+    code = language.model.render(camera, color=False).feature
+    assert got.color is not None
+    assert image is not None
+    assert code is not None
+    assert torch.equal(got.color, image)
+    assert code.abs().max() > 0
+    torch.testing.assert_close(got.feature, code, rtol=0, atol=1e-6)
     assert both.count == color.model.count + language.model.count
 
 

@@ -1,7 +1,9 @@
 """Further training views, rendered once from a first model of colour: the offline augmentation of tab:ov-cmp (systems.md D.17)."""
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from vlgs.blend import UniformBlend, blend_camera
+from vlgs.files import write_atomically
 from vlgs.module.sampler import nearest_views
 from vlgs.render.model import SplatModel
 from vlgs.types import Camera, Scene, View
@@ -33,6 +36,9 @@ class NoAugment:
     def identity(self) -> str:
         """See `Offline`."""
         return ""
+
+    def require(self, scenes: Mapping[int | None, Scene]) -> None:
+        """See `Offline`."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +92,7 @@ class Offline:
                 raise ValueError("augment: data must have a mask level for the extractor, got none")
 
     def extend(
-        self, scenes: Mapping[int | None, Scene], model: SplatModel, seed: int
+        self, scenes: Mapping[int | None, Scene], model: SplatModel, seed: int, folder: Path
     ) -> dict[int | None, Scene]:
         """The same scenes with further training views.
 
@@ -94,12 +100,12 @@ class Offline:
             scenes: Mask level -> scene; they share cameras.
             model: Renders the images.
             seed: Of the cameras.
+            folder: Where an extractor's maps are kept, all levels of a view in one file: they are dear.
         """
         shots = self._shoot(next(iter(scenes.values())), model, seed)
-        described: dict[int, Any] = {}  # one extraction gives all levels
         extended = {}
         for level, scene in scenes.items():
-            maps = [self._describe(scene, shot, level, described) for shot in shots]
+            maps = [self._describe(scene, shot, level, folder) for shot in shots]
             extended[level] = _with_views(scene, shots, maps)
         return extended
 
@@ -123,20 +129,24 @@ class Offline:
         return shots
 
     def _describe(
-        self, scene: Scene, shot: Shot, level: int | None, described: dict[int, Any]
+        self, scene: Scene, shot: Shot, level: int | None, folder: Path
     ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]] | None:
         if len(scene.mask_vectors) == 0:
             return None
         if self.extractor is None:
             assert scene.supervise is not None  # `require`
             return scene.supervise(shot.camera, shot.number)
-        if shot.number not in described:
-            described[shot.number] = self.extractor(shot.image.numpy(), _name(shot))
-        index = torch.from_numpy(described[shot.number].ids[level])
+        path = folder / f"{_name(shot)}.npz"
+        if not path.is_file():
+            found, stream = self.extractor(shot.image.numpy(), _name(shot)), io.BytesIO()
+            np.savez(stream, ids=found.ids, vectors=found.vectors)
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, stream.getvalue())
+        with np.load(path, allow_pickle=False) as kept:
+            index, every = torch.from_numpy(kept["ids"][level]), torch.from_numpy(kept["vectors"])
         rows, compact = index.unique(return_inverse=True)
         first = int(rows[0] < 0)
-        vectors = torch.from_numpy(described[shot.number].vectors)[rows[rows >= 0].long()]
-        return (compact - first).int(), vectors
+        return (compact - first).int(), every[rows[rows >= 0].long()]
 
 
 def _with_views(

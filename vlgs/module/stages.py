@@ -17,6 +17,9 @@ from vlgs.render.model import SplatModel
 from vlgs.runs import RunFolder
 from vlgs.types import Scene
 
+AUGMENT = "augment"
+"""Name of the model that renders further training views."""
+
 
 class StoppedError(Exception):
     """Training was asked to stop; what was reached is saved."""
@@ -54,6 +57,11 @@ class Stages:
     done: dict[str, Stage] = field(default_factory=dict)
     """Name -> stage, in the order of training."""
 
+    @property
+    def kept(self) -> list[Stage]:
+        """What the result is made of: all but the model that only rendered further views."""
+        return [stage for name, stage in self.done.items() if name != AUGMENT]
+
     def train(self, name: str, scene: Scene, color: bool = True) -> SplatModel:
         """Train a model, or read it back.
 
@@ -89,21 +97,21 @@ def train_all(
         stages: Where and with what.
         scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate``.
         sharing: Whether colour and language are one model.
-        augment: Further training views, rendered from a first model of colour alone (systems.md D.17).
+        augment: Further training views, rendered from a first model of colour alone (systems.md D.17); what `Offline.require`
+            asks for is there.
 
     Returns:
         One model per level, in their order; one alone if there is no language.
 
     Raises:
         StoppedError: If training was asked to stop.
-        ValueError: If there is nothing to make language maps of further views with.
     """
     if not any(len(scene.mask_vectors) for scene in scenes.values()):
         scenes = dict(list(scenes.items())[-1:])
     if isinstance(augment, Offline):
-        augment.require(scenes)
-        first = stages.train("augment", without_language(next(iter(scenes.values()))))
-        scenes = augment.extend(scenes, first, stages.seed)
+        first = stages.train(AUGMENT, without_language(next(iter(scenes.values()))))
+        maps = stages.folder.path / AUGMENT / "language"
+        scenes = augment.extend(scenes, first, stages.seed, maps)
     models, color = [], None
     for level, scene in scenes.items():
         name = f"level_{level}" if len(scenes) > 1 else ""

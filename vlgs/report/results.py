@@ -39,7 +39,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "units_lerf_ovs": ("", "units that LERF-OVS localisation was scored on"),
     "test_views": ("", "held-out views"),
     "test_views_seen": ("", "held-out views that were also trained on; 0 for a fair split"),
-    "n_gaussians": ("", "Gaussians at the end, of all models that are evaluated together"),
+    "n_gaussians": ("", "Gaussians at the end, of all models of the run together"),
     "levels": (
         "",
         "mask level of each model: one of data.level, or 1, 2, 3 with levels=separate; empty without language",
