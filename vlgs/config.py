@@ -34,6 +34,11 @@ NOT_PART_OF_A_RUN = frozenset(
 """Keys that cannot move a number. `data` is replaced by the fingerprint of the scene it leads to, so that a run does
 not depend on the folder that its data lies in."""
 
+LEVELS = (1, 2, 3)
+"""Mask levels of ``levels=separate``: subpart, part, whole, finest first (systems.md D.8)."""
+
+_NO_FUSION = "vlgs.fusion.none.NoFusion"
+
 GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
@@ -53,6 +58,17 @@ def check_config(config: DictConfig) -> None:
             raise ValueError(f"config: {key} must be an integer of at least {least}, got {value}")
     if config.on_existing not in ("resume", "refuse"):
         raise ValueError(f"config: on_existing must be resume or refuse, got {config.on_existing}")
+    if config.levels not in ("single", "separate"):
+        raise ValueError(f"config: levels must be single or separate, got {config.levels}")
+    if config.levels == "separate" and "level" not in config.data:
+        raise ValueError(
+            "config: data must have mask levels with levels=separate, got no data.level"
+        )
+    if not config.sharing.get("means", True) and config.fusion._target_ != _NO_FUSION:
+        raise ValueError(
+            "config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, "
+            f"got {config.fusion._target_}"
+        )
     check_targets(config)
 
 

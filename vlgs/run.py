@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from vlgs.config import (
     CONF,
     GIVEN_FILES,
+    LEVELS,
     RESULTS_VERSION,
     check_config,
     identity,
@@ -38,6 +39,11 @@ def main(config: DictConfig) -> None:
             raise
         print(f"error: {error}", file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
+    except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
+        if not alone:
+            raise
+        print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(STOPPED)
     if status:
         sys.exit(status)
 
@@ -54,36 +60,45 @@ def run(config: DictConfig) -> int:
     from vlgs.interchange import file_digest
 
     torch.set_num_threads(config.threads)
-    scene = instantiate(config.data)
+    scenes = _scenes(config)
     given = {key: config[group].get(key) for group, key in GIVEN_FILES}
-    content = " ".join([scene.fingerprint, *(file_digest(p, k) for k, p in given.items() if p)])
+    augment = instantiate(config.augment)
+    augment.require(scenes)
+    read = [*(scene.fingerprint for scene in scenes.values()), augment.identity()]
+    read += [file_digest(path, key) for key, path in given.items() if path]
+    content = " ".join(filter(None, read))
     folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
         )
     with folder.writing():
-        return _run_in(folder, config, scene)
+        return _run_in(folder, config, scenes)
 
 
-def _run_in(folder: RunFolder, config: DictConfig, scene: Any) -> int:
+def _scenes(config: DictConfig) -> dict[int | None, Any]:
+    """Mask level -> scene; the last one, of whole objects with ``levels=separate``, stands for what they share."""
+    if config.levels == "single":
+        return {config.data.get("level"): instantiate(config.data)}
+    return {level: instantiate(config.data, level=level) for level in LEVELS}
+
+
+def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> int:
     finished = folder.finished()
     if finished is not None:
         log.info("this run exists: %s (nothing was computed)", folder.path)
         return _say(finished, folder)
-    text = _text_encoder(config, scene)
+    from vlgs.module.stages import StoppedError, train_all
+
+    text = _text_encoder(config, next(reversed(scenes.values())))
     folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
-    module, stopped_by = _train(folder, config, scene)
-    if stopped_by is not None:
-        log.warning(
-            "%s: stopped and saved at step %d of %d; the same command goes on from there:\n  %s",
-            stopped_by,
-            module.next_step,
-            module.settings.iterations,
-            _command(),
-        )
+    stages = _stages(folder, config, scenes)
+    try:
+        models = train_all(stages, scenes, instantiate(config.sharing), instantiate(config.augment))
+    except StoppedError as stop:
+        log.warning("%s; the same command goes on from there:\n  %s", stop, _command())
         return STOPPED
-    return _say(_report(folder, config, scene, module, text), folder)
+    return _say(_report(folder, config, scenes, models, stages, text), folder)
 
 
 def _say(metrics: dict[str, Any], folder: RunFolder) -> int:
@@ -114,52 +129,66 @@ def _text_encoder(config: DictConfig, scene: Any) -> Any:
     return text
 
 
-def _train(folder: RunFolder, config: DictConfig, scene: Any) -> tuple[Any, str | None]:
+def _stages(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> Any:
     import torch
 
-    from vlgs.module.build import Parts, build_module
-    from vlgs.module.fit import FitOptions, fit
+    from vlgs.module.build import Parts
+    from vlgs.module.fit import FitOptions
+    from vlgs.module.stages import Stages
 
-    # Initial weights of the fusion come from the global generator; every other draw has one of its own.
-    torch.manual_seed(config.seed)
-    parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
-    module = build_module(scene, parts, config.seed)
-    options = FitOptions(
-        meta={
+    def make_parts() -> Parts:
+        # Initial weights of the fusion come from the global generator; every other draw has one of its own.
+        torch.manual_seed(config.seed)
+        return Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+
+    def make_options() -> FitOptions:
+        meta = {
             "config": OmegaConf.to_container(config, resolve=True),
-            "fingerprint": scene.fingerprint,
-        },
-        progress=config.progress,
-        loggers=[instantiate(logger) for logger in config.logger.loggers],
-    )
-    return module, fit(module, folder, options)
+            "fingerprint": " ".join(scene.fingerprint for scene in scenes.values()),
+        }
+        loggers = [instantiate(logger) for logger in config.logger.loggers]
+        return FitOptions(meta=meta, progress=config.progress, loggers=loggers)
+
+    return Stages(folder, make_parts, make_options, config.seed)
 
 
 def _report(
-    folder: RunFolder, config: DictConfig, scene: Any, module: Any, text: Any
+    folder: RunFolder,
+    config: DictConfig,
+    scenes: dict[int | None, Any],
+    models: list[Any],
+    stages: Any,
+    text: Any,
 ) -> dict[str, Any]:
-    """Everything that is said about a trained model; metrics.json is written last and makes the run a finished one."""
+    """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
     from vlgs.gaussians import write_ply
+    from vlgs.module.stages import all_skips
     from vlgs.report.evaluate import evaluate, prompts_of
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
     from vlgs.report.results import write_metrics, write_queries
     from vlgs.report.timing import measure_fps
 
-    model, query, protocol = module.model, instantiate(config.query), instantiate(config.protocol)
-    write_ply(folder.ply, model.splats)
-    evaluation = evaluate(model, scene, query, text, protocol)
+    model, scene = models[-1], next(reversed(scenes.values()))
+    query, protocol = instantiate(config.query), instantiate(config.protocol)
+    done, kept = stages.done.values(), stages.kept
+    for stage in kept:
+        write_ply(stage.folder.ply, stage.model.splats)
+    evaluation = evaluate(models, scene, query, text, protocol)
     prompts, _ = prompts_of(scene, query, text)
     timing = measure_fps(model, [view.camera for view in scene.test or scene.train], query, prompts)
     if config.pictures:
         write_pictures(folder.renders, model, scene, query, prompts)
     extra = {
-        "n_gaussians": model.count,
-        "train_seconds": module.train_seconds,
-        "skips": module.skips.report(),
+        "n_gaussians": sum(stage.model.count for stage in kept),
+        "levels": [level for level in scenes if level is not None]
+        if len(scene.mask_vectors)
+        else [],
+        "train_seconds": sum(stage.seconds for stage in done),
+        "skips": all_skips(done).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "ply_bytes": folder.ply.stat().st_size,
-        "checkpoint_bytes": max(f.stat().st_size for f in folder.checkpoint.glob("*.safetensors")),
+        "ply_bytes": sum(stage.folder.ply.stat().st_size for stage in kept),
+        "checkpoint_bytes": sum(_checkpoint_bytes(stage.folder) for stage in kept),
         "seed": config.seed,
         "config_hash": folder.path.name,
         "recipe": identity(config).recipe,
@@ -176,6 +205,10 @@ def _report(
     return write_metrics(folder.metrics, evaluation, extra)
 
 
+def _checkpoint_bytes(folder: RunFolder) -> int:
+    return max(file.stat().st_size for file in folder.checkpoint.glob("*.safetensors"))
+
+
 def _places(folder: RunFolder) -> dict[str, Path]:
     """What the summary points at."""
     places = {"run": folder.path, "pictures": folder.renders / "overview.png", "model": folder.ply}
@@ -190,7 +223,8 @@ def _dataset(config: DictConfig) -> str:
 
 
 def _command() -> str:
-    return " ".join(["python -m vlgs.run", *HydraConfig.get().overrides.task])
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    return " ".join(["python -m vlgs.run", *overrides])
 
 
 if __name__ == "__main__":

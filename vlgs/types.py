@@ -101,8 +101,22 @@ class Scene:
     vocabulary: Vocabulary | None = None
     label_set: str = ""
     """Which labels of a data set these are, where there are several (``mipnerf360_goi``); part of the protocol's name."""
+    supervise: Callable[[Camera, int], tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]]] | None = (
+        None
+    )
+    """Where a scene can look from anywhere: camera and number -> language supervision as of a training view, with a row of its own
+    vectors per pixel, or -1. Faults are a function of the number."""
     fingerprint: str = ""
     """Content hash of all that was read; two scenes with one fingerprint give one result."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Covariances of Gaussians: R S S^T R^T."""
+
+    quats: Float[Tensor, "n 4"]
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the principal axes, world units, >= 0."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +137,8 @@ class Gaussians:
     """Coefficients of degrees 1 to 3; s is 0, 3, 8 or 15."""
     features: Float[Tensor, "n d"]
     """Language code f."""
+    language_shape: Shape | None = None
+    """Covariance that language is blended with; None where it is colour's (``sharing=pos``, tab:ab-seperate)."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +151,8 @@ class ChannelGroup:
     """Opacity, indicator, ...; in [0, 1]. Groups that share this very tensor share one transmittance chain."""
     shape_grad: bool = True
     """Whether this group's gradient reaches means, quats and scales (systems differ: Feature-3DGS as released says no)."""
+    shape: Shape | None = None
+    """Covariances of this group's own, around the same means and in the same depth order; None: those of the scene."""
 
 
 @dataclass(frozen=True)

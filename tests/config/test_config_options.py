@@ -8,6 +8,8 @@ from vlgs.config import CONF, check_targets, instantiate
 
 CONSTRUCTED = (
     "gaussians",
+    "sharing",
+    "augment",
     "fusion",
     "indicator",
     "blend",

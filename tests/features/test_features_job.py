@@ -54,6 +54,23 @@ def maps_of(root: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.glob("*.npy")}
 
 
+def test_a_scene_of_a_release_gets_its_maps_in_its_own_folder(tmp_path: Path):
+    write_scene(tmp_path / "release" / "bed", size=(70, 50))
+    release = str(tmp_path / "release")
+    overrides = (
+        "data=ovs3d",
+        f"data.root={release}",
+        "data.scene=bed",
+        "data.labels=null",
+        "data.split=llff",
+    )
+    described = config(Path(release), None, *overrides, *QUICK)
+    planned = job.plan(described)
+    assert planned.folder.path == tmp_path / "release" / "bed" / "language_features"
+    assert len(planned.views) > 0
+    assert planned.views[0].photograph.width == 70
+
+
 def test_photographs_become_language_that_training_reads(scene: Path, weights: Path):
     extract(config(scene, weights, *LOOSE))
     read = load_scene(str(scene), resize=0.5)

@@ -216,6 +216,10 @@ def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
         ["fusion=cross", "blend=gaussian", "blend.convention=paper"],
         ["blend=uniform", "blend.rotation=false", "loss.rgb_loss=l1_dssim"],
         ["gaussians.densify_on=rgb", "gaussians.prune_on=opacity", "gaussians.sh_degree=0"],
+        ["gaussians.color=rgb", "gaussians.prune_on=indicator", "blend.mask=or"],
+        ["gaussians.color=evaluated", "blend.pairs=neighbours", "trainer.means_steps=30000"],
+        ["gaussians.init_features=lifted", "blend.kept=nearer", "blend.rotation=false"],
+        ["sharing=pos", "gaussians.densify.reset_indicator=true", "indicator=opacity"],
     ],
     ids=" ".join,
 )

@@ -64,12 +64,13 @@ def blend_camera(camera1: Camera, camera2: Camera, k: float, blend: ViewBlend) -
         return camera2
 
     viewmats = torch.stack([camera1.viewmat, camera2.viewmat]).double()
-    rotation, center = viewmats[0, :3, :3], camera_center(viewmats[0])
+    kept = viewmats[1 if blend.kept == "nearer" and k < 0.5 else 0]
+    rotation, center = kept[:3, :3], camera_center(kept)
     if blend.rotation:
         quats = rotmat_to_quat(viewmats[:, :3, :3])
         rotation = quat_to_rotmat(slerp(quats[0], quats[1], k, blend.convention))
     if blend.translation:
-        center = torch.lerp(camera_center(viewmats[1]), center, k)
+        center = torch.lerp(camera_center(viewmats[1]), camera_center(viewmats[0]), k)
     viewmat = pose_matrix(rotation, center).to(camera1.viewmat.dtype)
     K = torch.lerp(camera2.K, camera1.K, min(max(k, 0.0), 1.0))
     return Camera(viewmat, K, camera1.width, camera1.height)

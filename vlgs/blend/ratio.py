@@ -18,9 +18,9 @@ class ViewBlend(ABC):
     """
 
     rotation: bool = True
-    """Off: the rotation of view 1 is kept (S. D.12)."""
+    """Off: the rotation of view 1 is kept (S. D.12); see `kept`."""
     translation: bool = True
-    """Off: the centre of view 1 is kept."""
+    """Off: the centre of view 1 is kept; see `kept`."""
     ssim: bool = True
     """Off: the loss is not weighted by the similarity of the two photographs."""
     convention: Convention = "consistent"
@@ -29,11 +29,21 @@ class ViewBlend(ABC):
     """Which pixels of the mixed language map count: those where both views have a code, or where either has."""
     renormalise: bool = False
     """Whether mixed codes get back the length that mixing takes from them."""
+    kept: Literal["first", "nearer"] = "first"
+    """Whose rotation or centre stays where one of them is not blended: that of view 1, or of the view whose weight is larger (S. D.12)."""
+    pairs: Literal["uniform", "neighbours"] = "uniform"
+    """Whether the second view of an iteration is any other, or one of the nearest (S. D.13)."""
+    neighbours: int = 4
+    """How many are near, for ``pairs=neighbours``."""
 
     def __post_init__(self) -> None:
         who = type(self).__name__
         _require_choice(who, "convention", self.convention, ("consistent", "paper"))
         _require_choice(who, "mask", self.mask, ("and", "or"))
+        _require_choice(who, "kept", self.kept, ("first", "nearer"))
+        _require_choice(who, "pairs", self.pairs, ("uniform", "neighbours"))
+        if self.neighbours < 1:
+            raise ValueError(f"{who}: neighbours must be at least 1, got {self.neighbours}")
 
     @property
     def active(self) -> bool:

@@ -83,7 +83,7 @@ def plan(config: DictConfig) -> Job:
     """
     if config.data._target_ != _COLMAP:
         raise ValueError(
-            f"features: data must be photographs with cameras (data=colmap), got {config.data._target_}"
+            f"features: data must be photographs with cameras (data=colmap or a data set of it), got {config.data._target_}"
         )
     options = OmegaConf.to_container(config.data, resolve=True, throw_on_missing=True)
     assert isinstance(options, dict)
@@ -95,7 +95,7 @@ def plan(config: DictConfig) -> Job:
         raise ValueError(
             f"features: max_height must be 1080 or null, as readers know no other size, got {chosen.max_height}"
         )
-    out = chosen.out or source.features or str(Path(source.root) / "language_features")
+    out = chosen.out or source.features or str(source.folder / "language_features")
     views = open_training_views(source, every_view=chosen.views == "all")
     settings = OmegaConf.to_container(chosen.extractor, resolve=True, throw_on_missing=True)
     return Job(

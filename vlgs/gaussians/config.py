@@ -61,11 +61,16 @@ class DensifyConfig:
 class GaussiansConfig:
     """What the Gaussians of a scene carry and how they start."""
 
+    color: Literal["rgb_dc", "rgb", "evaluated"] = "rgb_dc"
+    """Colour that is fused with language (systems.md D.7): the RGB of degree 0, to which the other degrees are added after fusion; RGB
+    without harmonics; or all degrees as the view sees them, with which language depends on the view too."""
     sh_degree: int = 3
-    """Highest spherical harmonics degree that is stored, 0 to 3."""
+    """Highest spherical harmonics degree that is stored, 0 to 3; see `degree`."""
     init_opacity: float = 0.1
     init_indicator: float = 0.1
     """The paper starts the indicator in the same manner as the opacity (systems.md A.11)."""
+    init_features: Literal["zero", "lifted"] = "zero"
+    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (systems.md D.9, F.4)."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     max_init_angle: float = 0.1
@@ -73,9 +78,9 @@ class GaussiansConfig:
     the cameras and the scene would otherwise cover whole views."""
     max_count: int = 200_000
     """Sparse points beyond this are left out, and densification stops growing here."""
-    prune_on: Literal["max", "opacity"] = "max"
+    prune_on: Literal["max", "opacity", "indicator"] = "max"
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
-    reading of the paper (systems.md D.10)."""
+    reading of the paper (systems.md D.10); ``indicator`` is for Gaussians of language alone."""
     init: str | None = None
     """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
@@ -91,13 +96,20 @@ class GaussiansConfig:
         _require_at_least("gaussians", 1, init_points=self.init_points, max_count=self.max_count)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
-            "prune_on": ("max", "opacity"),
+            "color": ("rgb_dc", "rgb", "evaluated"),
+            "init_features": ("zero", "lifted"),
+            "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
         }.items():
             if getattr(self, name) not in options:
                 raise ValueError(
                     f"gaussians: {name} must be {' or '.join(options)}, got {getattr(self, name)}"
                 )
+
+    @property
+    def degree(self) -> int:
+        """Spherical harmonics degree that the Gaussians have: none with ``color=rgb``."""
+        return 0 if self.color == "rgb" else self.sh_degree
 
 
 def _require_at_least(who: str, least: int, **values: int) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -104,6 +105,7 @@ def densify(
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
+    A Gaussian with two shapes is as large as the larger one, and its children are drawn from colour's.
     Parameters are replaced in `params` and in the optimiser's groups of the same name; Adam's moments follow their
     Gaussian and are zero for new ones. `state` restarts at zero. The result is a function of the arguments alone.
 
@@ -126,11 +128,11 @@ def densify(
         dead = _dead(params, config)
         grow = _hot(state, config) & ~dead
         grow = _highest(grow, state.mean(), config.max_count - int((~dead).sum()))
-        small = params["log_scales"].amax(dim=1).exp() <= config.densify.dense_share * extent
+        small = _largest_scale(params) <= config.densify.dense_share * extent
         rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
         values = {name: value[rows.source] for name, value in params.items()}
         _place_children(values, rows, seeded_generator("densify", seed, step))
-        kept = _not_large(values["log_scales"], config, extent, step)
+        kept = _not_large(_largest_scale(values), config, extent, step)
         if not kept.all():
             rows, values = rows[kept], {name: value[kept] for name, value in values.items()}
     _replace(params, optimizer, values, rows)
@@ -158,11 +160,15 @@ def reset_opacity(
 
 def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
     """Gaussians that no image would miss, and those that are not Gaussians at all."""
-    weight = params["opacity_logits"].sigmoid()
+    name = "indicator_logits" if config.prune_on == "indicator" else "opacity_logits"
+    weight = params[name].sigmoid()
     if config.prune_on == "max":
         weight = weight.maximum(params["indicator_logits"].sigmoid())
     # A scale that overflows and a rotation of length zero are as broken as a NaN.
-    finite = params["log_scales"].exp().isfinite().all(dim=1) & (params["quats"].norm(dim=1) > 0)
+    finite = _largest_scale(params).isfinite()
+    for name in ("quats", "language_quats"):
+        if name in params:
+            finite &= params[name].norm(dim=1) > 0
     for value in params.values():
         finite &= value.isfinite().flatten(1).all(dim=1) if value.dim() > 1 else value.isfinite()
     if not finite.any():
@@ -221,18 +227,27 @@ def _place_children(values: dict[str, Tensor], rows: _Rows, generator: torch.Gen
     )
     rotation = quat_to_rotmat(values["quats"][rows.child])
     values["means"][rows.child] += (rotation @ offsets[..., None]).squeeze(-1)
-    values["log_scales"][rows.child] = log_scales - math.log(SHRINK)
+    for name in ("log_scales", "language_log_scales"):
+        if name in values:
+            values[name][rows.child] -= math.log(SHRINK)
+
+
+def _largest_scale(params: nn.ParameterDict | Mapping[str, Tensor]) -> Float[Tensor, " n"]:
+    """Of colour's shape and, where it has one, of language's."""
+    log_scales = params["log_scales"]
+    if "language_log_scales" in params:
+        log_scales = torch.cat([log_scales, params["language_log_scales"]], dim=1)
+    return log_scales.amax(dim=1).exp()
 
 
 def _not_large(
-    log_scales: Float[Tensor, "n 3"], config: GaussiansConfig, extent: float, step: int
+    largest: Float[Tensor, " n"], config: GaussiansConfig, extent: float, step: int
 ) -> Bool[Tensor, " n"]:
     """Gaussians that stay, once large ones are looked for.
 
     3DGS also names a radius of 20 px on the screen; its code as released clears the radii just before it looks at
     them, so that only the size in the world ever counted. That is what is done here.
     """
-    largest = log_scales.amax(dim=1).exp()
     first_reset = config.densify.reset_every
     if not config.densify.prune_large or first_reset == 0 or step <= first_reset:
         return torch.ones_like(largest, dtype=torch.bool)

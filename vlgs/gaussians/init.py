@@ -48,7 +48,7 @@ def initialise(
     Args:
         scene: With at least one training view.
         config: What the Gaussians carry.
-        feature_dim: Width d of the language code, which starts at zero (systems.md D.9).
+        feature_dim: Width d of the language code, which starts at zero here (systems.md D.9).
         seed: Decides the random points, and which ones are kept when there are more than `max_count`.
 
     Raises:
@@ -95,7 +95,7 @@ def _parameters(
         "quats": quats,
         "log_scales": scales.log()[:, None].repeat(1, 3),
         "sh0": rgb_to_sh(cloud.colors),
-        "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3),
+        "shN": torch.zeros(n, (config.degree + 1) ** 2 - 1, 3),
         "opacity_logits": torch.full((n,), logit(config.init_opacity)),
         "indicator_logits": torch.full((n,), logit(config.init_indicator)),
         "features": torch.zeros(n, feature_dim),

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from vlgs.types import Gaussians
+from vlgs.types import Gaussians, Shape
 
 PARAMETERS = (
     "means",
@@ -21,6 +21,9 @@ PARAMETERS = (
 )
 """Keys of the raw parameters: means [n, 3], quats [n, 4], log_scales [n, 3], sh0 [n, 3], shN [n, s, 3],
 opacity_logits [n], indicator_logits [n], features [n, d]. Row i of every one of them is Gaussian i."""
+
+LANGUAGE_SHAPE = ("language_quats", "language_log_scales")
+"""Keys that are there only where language has covariances of its own (``sharing=pos``): [n, 4] and [n, 3]."""
 
 
 def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:
@@ -46,11 +49,27 @@ def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:
         sh0=params["sh0"],
         shN=params["shN"],
         features=params["features"],
+        language_shape=_language_shape(params),
     )
 
 
+def _language_shape(params: nn.ParameterDict | Mapping[str, Tensor]) -> Shape | None:
+    if "language_quats" not in params:
+        return None
+    return Shape(params["language_quats"], params["language_log_scales"].exp())
+
+
+def with_language_shape(params: Mapping[str, Tensor], own: bool) -> dict[str, Tensor]:
+    """The same Gaussians with, or without, covariances of their own for language; they start as colour's."""
+    shared = {name: value for name, value in params.items() if name not in LANGUAGE_SHAPE}
+    if not own:
+        return shared
+    started = {f"language_{name}": params[name].clone() for name in ("quats", "log_scales")}
+    return shared | {name: params.get(name, started[name]) for name in LANGUAGE_SHAPE}
+
+
 def complete(params: Mapping[str, Tensor], feature_dim: int) -> dict[str, Tensor]:
-    """All of `PARAMETERS`, in order, of what another system's file holds.
+    """All of `PARAMETERS`, in order, of what another system's file holds, and `LANGUAGE_SHAPE` where it is there.
 
     Args:
         params: Without `indicator_logits` the opacity's take their place; without `features` they are zero.
@@ -58,7 +77,8 @@ def complete(params: Mapping[str, Tensor], feature_dim: int) -> dict[str, Tensor
     """
     n, opacity = len(params["means"]), params["opacity_logits"]
     absent = {"indicator_logits": opacity.clone(), "features": torch.zeros(n, feature_dim)}
-    return {name: params[name] if name in params else absent[name] for name in PARAMETERS}
+    named = {name: params[name] if name in params else absent[name] for name in PARAMETERS}
+    return named | {name: params[name] for name in LANGUAGE_SHAPE if name in params}
 
 
 def logit(probability: float) -> float:

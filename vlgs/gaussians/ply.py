@@ -32,8 +32,8 @@ def write_ply(
 ) -> None:
     """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
 
-    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator``; readers that look properties up by
-    name pass over them. The file is complete or the one before stays.
+    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator``, language's own covariances, where there
+    are any, as ``language_scale_0`` ... and ``language_rot_0`` ...; readers that look properties up by name pass over them. The file is complete or the one before stays.
 
     Args:
         path: The file; its folder must exist.
@@ -60,6 +60,9 @@ def write_ply(
         _append(named, _numbered(stem, columns["features"].shape[1]), columns["features"])
     if dialect == "vlgs":
         _append(named, ("indicator",), columns["indicator_logits"][:, None])
+        if "language_quats" in columns:
+            _append(named, _numbered("language_scale", 3), columns["language_log_scales"])
+            _append(named, _numbered("language_rot", 4), columns["language_quats"])
     vertices = np.empty(len(columns["means"]), dtype=[(name, "<f4") for name, _ in named])
     for name, column in named:
         vertices[name] = column.numpy()
@@ -127,6 +130,9 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
         params["indicator_logits"] = take("indicator")[:, 0]
     if n_lang:
         params["features"] = take(*_numbered(stem, n_lang))
+    if "language_rot_0" in present:
+        params["language_quats"] = take(*_numbered("language_rot", 4))
+        params["language_log_scales"] = take(*_numbered("language_scale", 3))
     return params
 
 

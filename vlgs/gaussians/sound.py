@@ -19,8 +19,9 @@ def broken_rows(params: Mapping[str, Tensor]) -> dict[str, Bool[Tensor, " n"]]:
         found[f"{name} must be finite"] = (
             broken if value.dim() == 1 else broken.flatten(1).any(dim=1)
         )
-    if "quats" in params:
-        found["quats must not be zero"] = params["quats"].norm(dim=1) == 0
+    for name in ("quats", "language_quats"):
+        if name in params:
+            found[f"{name} must not be zero"] = params[name].norm(dim=1) == 0
     return {what: rows for what, rows in found.items() if rows.any()}
 
 

@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 def start_from(path: str | Path, config: GaussiansConfig, feature_dim: int) -> dict[str, Tensor]:
-    """Raw parameters of a file for a model that stores `config.sh_degree` and codes of `feature_dim`.
+    """Raw parameters of a file for a model that stores `config.degree` and codes of `feature_dim`.
 
     Spherical harmonics are cut or filled with zeros. Language codes of another width start at zero. Those of LangSplat
     checkpoints come at unit length, as LangSplat renders them.
@@ -34,7 +34,7 @@ def start_from(path: str | Path, config: GaussiansConfig, feature_dim: int) -> d
     n = len(params["means"])
     if n == 0:
         raise ValueError(f"gaussians: init {path} must hold Gaussians, got none")
-    coefficients = (config.sh_degree + 1) ** 2 - 1
+    coefficients = (config.degree + 1) ** 2 - 1
     rest = torch.zeros(n, coefficients, 3)
     shared = min(coefficients, params["shN"].shape[1])
     rest[:, :shared] = params["shN"][:, :shared]

@@ -8,10 +8,12 @@ from vlgs.codec import Codec
 from vlgs.codec.autoencoder import Autoencoder
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
-from vlgs.gaussians import GaussiansConfig, initialise
+from vlgs.gaussians import GaussiansConfig, Sharing, initialise
+from vlgs.gaussians.parameters import with_language_shape
 from vlgs.indicator import Indicator
 from vlgs.interchange import load_weights, start_from
 from vlgs.losses import Losses
+from vlgs.module.lift import lift_features
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import TrainerConfig
 from vlgs.render.model import SplatModel
@@ -25,6 +27,7 @@ class Parts:
     """The points chosen on the axes; one field per configuration group."""
 
     gaussians: GaussiansConfig
+    sharing: Sharing
     fusion: Fusion
     indicator: Indicator
     blend: ViewBlend
@@ -34,8 +37,8 @@ class Parts:
     trainer: TrainerConfig
 
 
-def build_module(scene: Scene, parts: Parts, seed: int) -> VLGSModule:
-    """Fit the codec, place the Gaussians and put everything together.
+def build_module(scene: Scene, parts: Parts, seed: int, color: bool = True) -> VLGSModule:
+    """Fit the codec, place the Gaussians and put everything together; without `color` for language alone.
 
     Raises:
         ValueError: If the scene has no training view.
@@ -57,5 +60,12 @@ def build_module(scene: Scene, parts: Parts, seed: int) -> VLGSModule:
         parameters = initialise(scene, config, codec.dim, seed)
     else:
         parameters = start_from(config.init, config, codec.dim)
-    model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, sh_degree=0)
-    return VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed)
+    language = scene.mask_vectors.shape[0] > 0
+    own = language and parts.sharing.means and not parts.sharing.covariances
+    parameters = with_language_shape(parameters, own)
+    evaluated = config.color == "evaluated"
+    model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, 0, evaluated)
+    module = VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
+    if config.init_features == "lifted":
+        lift_features(module)
+    return module

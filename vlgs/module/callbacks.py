@@ -274,7 +274,7 @@ def psnr_of(mse: float) -> float:
         >>> psnr_of(0.01)
         20.0
     """
-    return -10.0 * math.log10(mse) if mse > 0 else math.inf
+    return math.inf if mse == 0 else -10.0 * math.log10(mse)
 
 
 def _own(module: L.LightningModule) -> VLGSModule:

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.gaussians.parameters import PARAMETERS
+from vlgs.gaussians.parameters import LANGUAGE_SHAPE
 from vlgs.module.skips import SkipCount
 from vlgs.render.frozen import FrozenView, FrozenViews
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
-from vlgs.types import Camera
+from vlgs.types import Camera, Shape
 
-GEOMETRY = frozenset({"means", "quats", "log_scales"})
+GEOMETRY = frozenset({"means", "quats", "log_scales", *LANGUAGE_SHAPE})
 
 
 def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None:
@@ -21,10 +21,10 @@ def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None
     Raises:
         ValueError: If a name is unknown, or Gaussians would still multiply and die, or their weights be reset.
     """
-    unknown = sorted(set(names) - set(PARAMETERS))
+    unknown = sorted(set(names) - set(model.splats))
     if unknown:
         raise ValueError(
-            f"train: trainer.freeze must name some of {', '.join(PARAMETERS)}, got {unknown}"
+            f"train: trainer.freeze must name some of {', '.join(model.splats)}, got {unknown}"
         )
     if names and densify_stop > 0:
         raise ValueError(
@@ -57,10 +57,13 @@ class FrozenRenders:
         opacities = fused.gaussians.opacities
         if opacities.requires_grad or (language and fused.language_weight.requires_grad):
             return None
-        by_color = self._view((index, "opacity"), camera, opacities, fused)
+        shape = Shape(fused.gaussians.quats, fused.gaussians.scales)
+        own = fused.gaussians.language_shape
+        by_color = self._view((index, "opacity"), camera, opacities, shape, fused)
         by_language = by_color
-        if language and fused.language_weight is not opacities:
-            by_language = self._view((index, "language"), camera, fused.language_weight, fused)
+        if language and (fused.language_weight is not opacities or own is not None):
+            weight = fused.language_weight
+            by_language = self._view((index, "language"), camera, weight, own or shape, fused)
         if by_color is None or by_language is None:
             return None
         return ViewRender(
@@ -73,7 +76,12 @@ class FrozenRenders:
         )
 
     def _view(
-        self, name: Hashable, camera: Camera, weight: Float[Tensor, " n"], fused: FusedGaussians
+        self,
+        name: Hashable,
+        camera: Camera,
+        weight: Float[Tensor, " n"],
+        shape: Shape,
+        fused: FusedGaussians,
     ) -> FrozenView | None:
         view = self.views.get(name)
         if view is not None:
@@ -85,8 +93,8 @@ class FrozenRenders:
             return self.views.make(
                 name,
                 means=fused.gaussians.means,
-                quats=fused.gaussians.quats,
-                scales=fused.gaussians.scales,
+                quats=shape.quats,
+                scales=shape.scales,
                 weight=weight,
                 camera=camera,
                 config=self.model.raster,

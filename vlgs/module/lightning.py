@@ -17,7 +17,7 @@ from vlgs.geometry import scene_extent
 from vlgs.losses import Losses, view_similarity
 from vlgs.module.blended import BlendPlan, plan_blend
 from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
-from vlgs.module.sampler import PairSampler
+from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.settings import TrainerConfig
 from vlgs.module.skips import SkipCount
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
@@ -66,6 +66,7 @@ class VLGSModule(L.LightningModule):
         gaussians_config: Densification.
         trainer_config: Budget, schedule and learning rates.
         seed: Seed of all draws.
+        color: Off: language alone is rendered and learned.
 
     Raises:
         ValueError: If the scene has no training view, or what is frozen cannot be (`vlgs.module.frozen.freeze`).
@@ -80,6 +81,7 @@ class VLGSModule(L.LightningModule):
         gaussians_config: GaussiansConfig,
         trainer_config: TrainerConfig,
         seed: int,
+        color: bool = True,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -90,8 +92,12 @@ class VLGSModule(L.LightningModule):
         self.gaussians_config = gaussians_config
         self.settings = trainer_config
         self.seed = seed
+        self.color = color
         sizes = tuple((view.camera.width, view.camera.height) for view in scene.train)
-        self.sampler = PairSampler(sizes, seed)
+        near = None
+        if blend.pairs == "neighbours":
+            near = nearest_views([view.camera for view in scene.train], blend.neighbours)
+        self.sampler = PairSampler(sizes, seed, near)
         self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
@@ -105,7 +111,9 @@ class VLGSModule(L.LightningModule):
         self.screen_gradients: tuple[Tensor, ...] = ()
         self.skips = SkipCount()
         self.frozen = None
-        if trainer_config.skip.frozen_weights and set(trainer_config.freeze) >= GEOMETRY:
+        geometry = GEOMETRY & set(model.splats)
+        keeps = trainer_config.skip.frozen_weights and color and not model.evaluated
+        if keeps and set(trainer_config.freeze) >= geometry:
             self.frozen = FrozenRenders(model, trainer_config.skip.frozen_budget, self.skips)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -143,8 +151,10 @@ class VLGSModule(L.LightningModule):
         if not torch.isfinite(total):
             raise FloatingPointError(f"train: loss must be finite, got {total.item()} {where}")
         self.optimizer.zero_grad(set_to_none=True)
-        if total.requires_grad:  # nothing that is trained may be in view
+        if total.requires_grad:
             self.screen_gradients = self._backward(total, color_losses, renders)
+        else:  # nothing that is trained is in view, or neither view has a mask
+            self.screen_gradients = tuple(torch.zeros_like(r.mean2d) for r in renders)
         if not self.settings.skip.finite_check:
             self._refuse_non_finite_gradients(where)
         self.optimizer.step()
@@ -185,7 +195,7 @@ class VLGSModule(L.LightningModule):
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = self.settings.learning_rates
         groups = [
-            {"params": [parameter], "lr": getattr(rates, name), "name": name}
+            {"params": [parameter], "lr": rates.of(name), "name": name}
             for name, parameter in self.model.splats.items()
             if parameter.requires_grad
         ]
@@ -217,18 +227,20 @@ class VLGSModule(L.LightningModule):
         return fused
 
     def _render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
-        language = target.codes is not None
+        language = target.codes is not None or not self.color
         if self.frozen is not None:
             kept = self.frozen.render(index, target.view.camera, language, fused)
             if kept is not None:
                 return kept
-        render = self.model.render(target.view.camera, language=language, fused=fused)
+        camera = target.view.camera
+        render = self.model.render(camera, color=self.color, language=language, fused=fused)
         if render.mean2d.requires_grad:
             render.mean2d.retain_grad()
         return render
 
     def _color_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
-        assert render.color is not None
+        if render.color is None:
+            return torch.zeros(())
         return self.losses.color_loss(render.color, target.image, _covered(target.view))
 
     def _language_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
@@ -304,7 +316,7 @@ class VLGSModule(L.LightningModule):
                 for render, target in zip(renders, targets, strict=True)
                 if render.color is not None
             ]
-            return float(torch.stack(errors).mean())
+            return float(torch.stack(errors).mean()) if errors else math.nan
 
     def _refuse_non_finite_gradients(self, where: str) -> None:
         """Stop before Adam spreads one bad number over everything (pitfalls N1)."""

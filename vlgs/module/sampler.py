@@ -1,9 +1,14 @@
 """Which views an iteration sees: a pure function of (seed, step), so that a resumed run is the same run."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+import torch
+
+from vlgs.geometry import camera_center
+from vlgs.types import Camera
 
 
 @dataclass(frozen=True)
@@ -16,10 +21,12 @@ class PairSampler:
     Args:
         sizes: (width, height) of every training view.
         seed: Seed of the run.
+        near: Per view those that the second one is drawn from, in place of the second stack (`nearest_views`).
     """
 
     sizes: tuple[tuple[int, int], ...]
     seed: int
+    near: tuple[tuple[int, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.sizes:
@@ -29,6 +36,9 @@ class PairSampler:
         """Indices of the two views of an iteration; equal only where no other view has the first one's size."""
         epoch, position = divmod(step, len(self.sizes))
         first = int(self._stack(0, epoch)[position])
+        if self.near is not None:
+            near = self.near[first] or (first,)
+            return first, near[int(self.rng(2, step).integers(len(near)))]
         second = int(self._stack(1, epoch)[position])
         if second != first and self.sizes[second] == self.sizes[first]:
             return first, second
@@ -59,3 +69,14 @@ class PairSampler:
 @lru_cache(maxsize=8)
 def _permutation(seed: int, which: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng([seed, which, epoch]).permutation(count)
+
+
+def nearest_views(cameras: Sequence[Camera], count: int | None) -> tuple[tuple[int, ...], ...]:
+    """Per camera the others of its image size whose centres are nearest, nearest first; all of them without a count."""
+    centers = camera_center(torch.stack([camera.viewmat for camera in cameras]).double())
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    near = []
+    for index, size in enumerate(sizes):
+        order = (centers - centers[index]).norm(dim=1).argsort(stable=True).tolist()
+        near.append(tuple(i for i in order if i != index and sizes[i] == size)[:count])
+    return tuple(near)

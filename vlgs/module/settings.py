@@ -9,7 +9,7 @@ class LearningRates:
     """Adam's rates per parameter (tab:lr); rates the paper does not give are marked."""
 
     means: float = 1.6e-4
-    """Multiplied by the scene extent, decays log-linearly to `means_final` over the run."""
+    """Multiplied by the scene extent, decays log-linearly to `means_final` over `TrainerConfig.means_steps`."""
     means_final: float = 1.6e-6
     """3DGS's final rate; the paper is silent (systems.md D.11)."""
     quats: float = 1e-3
@@ -22,6 +22,10 @@ class LearningRates:
     features: float = 5e-3
     fusion: float = 1e-3
     """The paper is silent (systems.md D.6)."""
+
+    def of(self, parameter: str) -> float:
+        """Rate of a parameter of the Gaussians; language's own shape is learned like colour's."""
+        return getattr(self, parameter.removeprefix("language_"))
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class TrainerConfig:
     learning_rates: LearningRates
     sh_every: int = 1000
     """Iterations after which the next spherical harmonics degree joins."""
+    means_steps: int | None = None
+    """Iterations over which the rate of the positions decays; None: all of the run (systems.md D.11)."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
@@ -74,8 +80,11 @@ class TrainerConfig:
                 f"{self.sh_every}, {self.log_every}, {self.checkpoint_every}"
             )
 
+        if self.means_steps is not None and self.means_steps < 1:
+            raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
+
     def means_rate(self, step: int) -> float:
         """Learning rate of positions at a step, in units of the scene extent (3DGS's log-linear decay)."""
-        share = min(step / self.iterations, 1.0)
+        share = min(step / (self.means_steps or self.iterations), 1.0)
         rates = self.learning_rates
         return rates.means * (rates.means_final / rates.means) ** share

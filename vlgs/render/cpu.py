@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
-from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
+from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered, Shape
 
 
 class Splats(NamedTuple):
@@ -33,7 +33,39 @@ def rasterize(
     config: RasterConfig,
 ) -> Rendered:
     """`vlgs.rasterize` on checked input."""
-    return blend(project(means, quats, scales, camera, config), groups, camera, config)
+    splats = project(means, quats, scales, camera, config)
+    if all(group.shape is None for group in groups):
+        return blend(splats, groups, camera, config)
+    images: list[Tensor] = [splats.mean2d] * len(groups)
+    alphas, visible = list(images), torch.zeros(len(means), dtype=torch.bool)
+    by_shape: dict[int, list[int]] = {}
+    for index, group in enumerate(groups):
+        by_shape.setdefault(id(group.shape), []).append(index)
+    for indices in by_shape.values():
+        own = _reshaped(splats, means, groups[indices[0]].shape, camera, config)
+        part = blend(own, [groups[i] for i in indices], camera, config)
+        for index, image, alpha in zip(indices, part.images, part.alphas, strict=True):
+            images[index], alphas[index] = image, alpha
+        visible |= part.visible
+    return Rendered(tuple(images), tuple(alphas), visible, splats.mean2d)
+
+
+def _reshaped(
+    splats: Splats,
+    means: Float[Tensor, "n 3"],
+    shape: Shape | None,
+    camera: Camera,
+    config: RasterConfig,
+) -> Splats:
+    """The same Gaussians with another covariance; centres stay one tensor, which gathers the gradients of all shapes."""
+    if shape is None:
+        return splats
+    try:
+        own = project(means, shape.quats, shape.scales, camera, config)
+    except ValueError as error:
+        raise ValueError(f"{error} of a group's own shape") from error
+    depth = torch.where(splats.depth > 0, own.depth, 0.0)
+    return Splats(splats.mean2d, own.ellipse, depth)
 
 
 def project(

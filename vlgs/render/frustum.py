@@ -3,11 +3,11 @@
 import math
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vlgs.render import cpu
-from vlgs.types import Camera, Gaussians, RasterConfig
+from vlgs.types import Camera, Gaussians, RasterConfig, Shape
 
 SLACK = 1.0
 """Pixels that cover what rounding takes away."""
@@ -19,7 +19,16 @@ def may_see(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> Bool[
 
     All others have no pixel in any group, whatever their weights and values.
     """
-    splats = cpu.project(gaussians.means, gaussians.quats, gaussians.scales, camera, config)
+    seen = _reaches(gaussians.means, Shape(gaussians.quats, gaussians.scales), camera, config)
+    if gaussians.language_shape is not None:
+        seen |= _reaches(gaussians.means, gaussians.language_shape, camera, config)
+    return seen
+
+
+def _reaches(
+    means: Float[Tensor, "n 3"], shape: Shape, camera: Camera, config: RasterConfig
+) -> Bool[Tensor, " n"]:
+    splats = cpu.project(means, shape.quats, shape.scales, camera, config)
     reach = math.sqrt(2 * math.log(1 / config.alpha_min)) * (1 + 1e-5)
     inv_x, slope, inv_y = splats.ellipse.unbind(1)
     half_y = reach / inv_y

@@ -49,12 +49,14 @@ class SplatModel(nn.Module):
     """What a checkpoint holds and an evaluation needs.
 
     Args:
-        parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`.
+        parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`, with or without `LANGUAGE_SHAPE`.
         fusion: Mixes colour and language of each Gaussian (Eq. attention).
         indicator: Chooses what blends language (Eq. lancity).
         codec: Embedding to language code and back.
         raster: Constants of the rasterizer.
         sh_degree: Highest spherical harmonics degree in use, 0 to 3.
+        evaluated: Whether colour is fused as each view sees it, so that what is blended as language depends on the view
+            (``gaussians.color=evaluated``, systems.md D.7); questions in 3D are then asked of the fusion with degree 0.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class SplatModel(nn.Module):
         codec: Codec,
         raster: RasterConfig,
         sh_degree: int,
+        evaluated: bool = False,
     ) -> None:
         super().__init__()
         self.splats = nn.ParameterDict({k: nn.Parameter(v) for k, v in parameters.items()})
@@ -73,6 +76,7 @@ class SplatModel(nn.Module):
         self.codec = codec
         self.raster = raster
         self.sh_degree = sh_degree
+        self.evaluated = evaluated
 
     @property
     def count(self) -> int:
@@ -126,11 +130,15 @@ class SplatModel(nn.Module):
         if not (color or language):
             raise ValueError("render: color or language must be true, got neither")
         fused = self.fuse() if fused is None else fused
-        groups = []
+        groups, values, feature = [], None, fused.feature
+        if self.evaluated:
+            values, feature = self._fuse_as_seen(fused.gaussians, camera)
         if color:
-            groups.append(ChannelGroup(self.view_color(fused, camera), fused.gaussians.opacities))
+            values = self.view_color(fused, camera) if values is None else values
+            groups.append(ChannelGroup(values, fused.gaussians.opacities))
         if language:
-            groups.append(ChannelGroup(fused.feature, fused.language_weight))
+            shape = fused.gaussians.language_shape
+            groups.append(ChannelGroup(feature, fused.language_weight, shape=shape))
         out = self._rasterize(fused.gaussians, groups, camera)
         return ViewRender(
             color=out.images[0] if color else None,
@@ -144,14 +152,25 @@ class SplatModel(nn.Module):
     def render_values(
         self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w c"]:
-        """Blend any per-Gaussian values with any weight, e.g. the l - o map of fig. lancity-vis."""
+        """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of fig. lancity-vis."""
         gaussians = self.gaussians()
-        return self._rasterize(gaussians, [ChannelGroup(values, weight)], camera).images[0]
+        group = ChannelGroup(values, weight, shape=gaussians.language_shape)
+        return self._rasterize(gaussians, [group], camera).images[0]
 
     def view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
         """RGB of every Gaussian as a camera sees it, >= 0."""
+        if self.evaluated:
+            return self._fuse_as_seen(fused.gaussians, camera)[0]
         gaussians, eye = fused.gaussians, camera_center(camera.viewmat)
         return view_color(fused.color, gaussians.shN, gaussians.means, eye, self.sh_degree)
+
+    def _fuse_as_seen(
+        self, gaussians: Gaussians, camera: Camera
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n d"]]:
+        eye, rgb = camera_center(camera.viewmat), sh_to_rgb(gaussians.sh0)
+        seen = view_color(rgb, gaussians.shN, gaussians.means, eye, self.sh_degree)
+        color, feature = self.fusion(seen, gaussians.features)
+        return color.clamp_min(0.0), feature
 
     def _rasterize(self, gaussians: Gaussians, groups: list[ChannelGroup], camera: Camera):
         return rasterize(

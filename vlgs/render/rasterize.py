@@ -31,10 +31,12 @@ def rasterize(
     One depth order and one pass over the image serve all groups; each has its own transmittance, and groups that share one
     weight tensor share one. Where nothing lies, images and accumulated weights are exactly 0. Gradients reach `means`,
     `quats`, `scales` and the values and weights of every group; those of `means`, `quats` and `scales` pass through
-    `Rendered.mean2d`, so that ``retain_grad()`` on it gives the gradient in pixels.
+    `Rendered.mean2d`, so that ``retain_grad()`` on it gives the gradient in pixels, of all groups together.
 
-    A Gaussian is left out, with zero gradient, where it is not beyond `RasterConfig.near` or its quaternion is zero. Ties in
-    depth are drawn in the order of the rows.
+    Groups with a `ChannelGroup.shape` are blended in a pass of their own, one per shape.
+
+    A Gaussian is left out, with zero gradient, where it is not beyond `RasterConfig.near` or its quaternion is zero; where
+    that of a group's own shape is zero, out of this group. Ties in depth are drawn in the order of the rows.
 
     Args:
         means: Centres, world units.
@@ -117,6 +119,9 @@ def check_tensors(
         channels = group.values.shape[1] if group.values.ndim == 2 else 1
         expected.append((f"groups[{i}].values", group.values, (n, max(channels, 1))))
         expected.append((f"groups[{i}].weight", group.weight, (n,)))
+        if group.shape is not None:
+            expected.append((f"groups[{i}].shape.quats", group.shape.quats, (n, 4)))
+            expected.append((f"groups[{i}].shape.scales", group.shape.scales, (n, 3)))
     for name, tensor, shape in expected:
         if tuple(tensor.shape) != shape:
             raise ValueError(
@@ -167,8 +172,11 @@ def _check_finite(
     named = [("means", means), ("quats", quats), ("scales", scales)]
     for i, group in enumerate(groups):
         named += [(f"groups[{i}].values", group.values), (f"groups[{i}].weight", group.weight)]
+        if group.shape is not None:
+            named.append((f"groups[{i}].shape.quats", group.shape.quats))
+            named.append((f"groups[{i}].shape.scales", group.shape.scales))
     for name, tensor in named:
-        low = 0.0 if name == "scales" or name.endswith("weight") else -math.inf
+        low = 0.0 if name.endswith(("scales", "weight")) else -math.inf
         high = 1.0 if name.endswith("weight") else math.inf
         good = tensor.isfinite() & (tensor >= low) & (tensor <= high)
         if not good.all():

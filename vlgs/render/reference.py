@@ -36,13 +36,18 @@ def rasterize(
 ) -> Rendered:
     """Image, accumulated weight and gradients as `vlgs.rasterize` defines them (Eqs. rgb-render, lancity)."""
     splats = _project(means, quats, scales, camera, config)
-    order = torch.argsort(splats.depth, stable=True)
-    order = order[splats.in_front[order]]
+    front_to_back = torch.argsort(splats.depth, stable=True)
+    front_to_back = front_to_back[splats.in_front[front_to_back]]
 
     images, alphas = [], []
     visible = torch.zeros_like(splats.in_front)
     for group in groups:
-        shape = splats if group.shape_grad else _Splats(*(t.detach() for t in splats))
+        shape, order = splats, front_to_back
+        if group.shape is not None:
+            own = _project(means, group.shape.quats, group.shape.scales, camera, config)
+            shape, order = own._replace(mean2d=splats.mean2d), order[own.in_front[order]]
+        if not group.shape_grad:
+            shape = _Splats(*(t.detach() for t in shape))
         exponent = _exponent(shape, order, camera.width, camera.height)
         alpha = group.weight[order, None] * torch.exp(-exponent)
         reaches = alpha >= config.alpha_min

@@ -45,15 +45,25 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "units_lerf_ovs": ("", "units that LERF-OVS localisation was scored on"),
     "test_views": ("", "held-out views"),
     "test_views_seen": ("", "held-out views that were also trained on; 0 for a fair split"),
-    "n_gaussians": ("", "Gaussians at the end"),
-    "train_seconds": ("s", "wall time of training, without reading, evaluation and pictures"),
+    "n_gaussians": ("", "Gaussians at the end, of all models of the run together"),
+    "levels": (
+        "",
+        "mask level of each model: one of data.level, or 1, 2, 3 with levels=separate; empty without language",
+    ),
+    "train_seconds": (
+        "s",
+        "wall time of training, of all models together, without reading, evaluation and pictures",
+    ),
     "skips": (
         "",
         "skip of vlgs.skips -> skipped (count), share (of that work), seconds_saved (wall time: count x mean cost of the "
         "forward part in this run; null where none was done to measure)",
     ),
     "peak_rss_bytes": ("B", "most memory the process ever held, reading to reporting"),
-    "fps_color": ("1/s", "colour render, median"),
+    "fps_color": (
+        "1/s",
+        "colour render, median; with several levels of the model of whole objects",
+    ),
     "fps_language": ("1/s", "language render, median"),
     "fps_query": ("1/s", "both renders, decoding and the relevancy of one prompt, median"),
     "ply_bytes": ("B", "point_cloud.ply"),

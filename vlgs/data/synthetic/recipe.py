@@ -8,6 +8,8 @@ from vlgs.data.synthetic.masks import Faults
 
 VERSION = 1
 """Part of every fingerprint; raise it with any change that moves a pixel, a label, a point or a vector."""
+MAX_VIEWS = 9999
+"""Training views; the faults of views that nobody photographed are drawn by numbers above."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Recipe:
         for name, low, high in (
             ("width", 16, 8192),
             ("height", 16, 8192),
-            ("train_views", 2, 9999),
+            ("train_views", 2, MAX_VIEWS),
             ("test_views", 0, self.train_views - 1),
             ("seed", 0, 2**63 - 1),
             ("points", 0, 10**7),

@@ -5,16 +5,17 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vlgs.data.synthetic.labels import dense_labels, object_labels
 from vlgs.data.synthetic.language import vocabulary
 from vlgs.data.synthetic.masks import Faults, LevelMasks, view_masks
+from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.points import view_points
-from vlgs.data.synthetic.recipe import Recipe
+from vlgs.data.synthetic.recipe import MAX_VIEWS, Recipe
 from vlgs.data.synthetic.studio import Shot, Studio, open_studio, regions
-from vlgs.types import Scene, View
+from vlgs.types import Camera, Scene, View
 
 _POINTS = 102  # purpose of draws
 
@@ -79,6 +80,7 @@ def load_scene(
         classes=studio.classes,
         class_kinds={thing.name: thing.kind for thing in studio.world.things},
         vocabulary=vocabulary(studio.classes),
+        supervise=lambda camera, number: _supervise(recipe, level, camera, number),
         fingerprint=recipe.fingerprint(level),
     )
 
@@ -88,14 +90,28 @@ def language_levels(
 ) -> Mapping[str, tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]]:
     """Supervision of every training view at levels 0 to 3, by view name; what `write_scene` puts on disk."""
     studio = open_studio(recipe)
+    return {shot.name: _levels(recipe, studio, shot.photo, shot.number) for shot in studio.train}
+
+
+def _supervise(
+    recipe: Recipe, level: int, camera: Camera, number: int
+) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]]:
+    """What stands in for SAM and CLIP on a rendered image: the exact regions at that camera, spoilt like those of a photograph.
+
+    Real extractors would also stumble over the faults of the render.
+    """
+    studio = open_studio(recipe)
+    photo = photograph(studio.world, camera)
+    masks = _levels(recipe, studio, photo, MAX_VIEWS + 1 + number)[level]
+    return torch.from_numpy(masks.index.astype(np.int32)), torch.from_numpy(masks.vectors)
+
+
+def _levels(
+    recipe: Recipe, studio: Studio, photo: Photograph, number: int
+) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
     faults = recipe.faults.resolve(recipe.difficulty)
-    key = (recipe.seed, zlib.crc32(f"{recipe.scene} {recipe.difficulty}".encode()))
-    return {
-        shot.name: view_masks(
-            *regions(studio.world, shot.photo), studio.classes, faults, (*key, shot.number)
-        )
-        for shot in studio.train
-    }
+    key = (recipe.seed, zlib.crc32(f"{recipe.scene} {recipe.difficulty}".encode()), number)
+    return view_masks(*regions(studio.world, photo), studio.classes, faults, key)
 
 
 def _view(studio: Studio, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:

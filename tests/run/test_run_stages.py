@@ -1,0 +1,113 @@
+"""Runs that train several models and evaluate them together."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_runs import TINY, composed
+
+from vlgs.gaussians import read_ply
+from vlgs.module.fit import fit
+from vlgs.module.lightning import VLGSModule
+from vlgs.run import run
+from vlgs.runs import STOPPED, RunFolder
+
+SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30", "pictures=false", "threads=1")
+SEPARATE = ("sharing=none", "fusion=none")
+KINDS = {
+    "sharing=none": (SEPARATE, {"color", "language"}),
+    "levels=separate": (("levels=separate",), {"level_1", "level_2", "level_3"}),
+    "augment=offline": (("augment=offline", "augment.views=3"), {"augment", ""}),
+    "all of it": (
+        ("levels=separate", "augment=offline", "augment.views=2", *SEPARATE),
+        {
+            *("augment", "color"),
+            *("level_1/language", "level_2/language", "level_3/language"),
+        },
+    ),
+}
+
+
+def only_run(results: Path) -> RunFolder:
+    (path,) = (results / "runs").iterdir()
+    return RunFolder(path)
+
+
+def metrics_of(folder: RunFolder) -> dict:
+    return json.loads(folder.metrics.read_text())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_model_has_a_folder_and_the_run_one_result(tmp_path: Path, kind: str):
+    overrides, stages = KINDS[kind]
+    config = composed(*SHORT, *overrides, f"results={tmp_path}")
+    config.pictures = kind == "sharing=none"
+    assert run(config) == 0
+    folder = only_run(tmp_path)
+    metrics = metrics_of(folder)
+    found = {str(path.parent.relative_to(folder.path)) for path in folder.path.rglob("*.ply")}
+    assert {"" if name == "." else name for name in found} == stages - {"augment"}
+    for name in stages:
+        assert RunFolder(folder.path / name).curves.is_file()
+    assert metrics["levels"] == ([1, 2, 3] if "levels=separate" in overrides else [3])
+    assert metrics["psnr"] > 8
+    assert metrics["miou"] is not None
+    assert metrics["train_seconds"] > 0
+    assert metrics["test_views_seen"] == 0
+    queries = json.loads(folder.queries.read_text())
+    assert {row["level"] for row in queries} <= {None, *range(len(metrics["levels"]))}
+    assert (folder.renders / "overview.png").is_file() == config.pictures
+
+
+def test_stopped_anywhere_it_goes_on_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    overrides = (*SHORT, *SEPARATE, "augment=offline", "augment.views=2")
+    assert run(composed(*overrides, f"results={tmp_path / 'whole'}")) == 0
+    whole = only_run(tmp_path / "whole")
+
+    steps = 0
+    original = VLGSModule.training_step
+
+    def stopping(self: VLGSModule, step: int, batch_idx: int) -> None:
+        nonlocal steps
+        original(self, step, batch_idx)
+        steps += 1
+        self.trainer.should_stop = steps % 25 == 0  # in each of the three models
+
+    def fit_until_stopped(module: VLGSModule, *rest: object) -> str | None:
+        fit(module, *rest)  # type: ignore[arg-type]
+        return None if module.next_step == module.settings.iterations else "SIGINT"
+
+    monkeypatch.setattr(VLGSModule, "training_step", stopping)
+    monkeypatch.setattr("vlgs.module.stages.fit", fit_until_stopped)
+    config = composed(*overrides, f"results={tmp_path / 'parts'}")
+    statuses = [run(config) for _ in range(4)]
+    assert statuses == [STOPPED, STOPPED, STOPPED, 0]
+    parts = only_run(tmp_path / "parts")
+    assert parts.path.name == whole.path.name
+    for name in ("color", "language"):
+        one, two = (read_ply(RunFolder(f.path / name).ply) for f in (whole, parts))
+        assert all(torch.equal(one[key], two[key]) for key in one), name
+    assert {k: metrics_of(parts)[k] for k in ("psnr", "miou", "per_view", "n_gaussians")} == {
+        k: metrics_of(whole)[k] for k in ("psnr", "miou", "per_view", "n_gaussians")
+    }
+    shutil.rmtree(parts.renders, ignore_errors=True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["sharing=none"], "fusion must be none with sharing=none.*got vlgs.fusion.*SelfAttention"),
+        (["levels=both"], "levels must be single or separate, got both"),
+        (["augment=offline", "augment.views=0"], "views and neighbours must be at least 1, got 0"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(
+    tmp_path: Path, overrides: list[str], message: str
+):
+    with pytest.raises(ValueError, match=message):
+        run(composed(*SHORT, *overrides, f"results={tmp_path}"))
+    assert not (tmp_path / "runs").exists()

@@ -1,0 +1,21 @@
+"""What colour and language have in common (tab:ab-seperate; systems.md D.16). Mirrored by conf/sharing."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Sharing:
+    """Whether the two modalities share centres and covariances; opacities are `vlgs.indicator`'s matter.
+
+    Raises:
+        ValueError: If covariances are shared by Gaussians that are not.
+    """
+
+    means: bool = True
+    """Off: two sets of Gaussians, each trained by the losses of its modality alone."""
+    covariances: bool = True
+    """Off: a second rotation and scale per Gaussian, with which language is blended."""
+
+    def __post_init__(self) -> None:
+        if self.covariances and not self.means:
+            raise ValueError("sharing: covariances must be false where means is false, got true")

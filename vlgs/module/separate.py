@@ -1,0 +1,66 @@
+"""Colour and language as two sets of Gaussians that share nothing (``sharing=none``; systems.md D.16)."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from vlgs.fusion.none import NoFusion
+from vlgs.gaussians.parameters import PARAMETERS
+from vlgs.indicator import Fixed, Learned
+from vlgs.module.build import Parts
+from vlgs.render.model import SplatModel
+from vlgs.types import Scene
+
+NOWHERE = -100.0
+"""Logit of a weight that is exactly 0 in float32."""
+
+
+def without_language(scene: Scene) -> Scene:
+    """The scene as colour alone sees it."""
+    return replace(
+        scene,
+        train=tuple(replace(view, read_masks=None) for view in scene.train),
+        mask_vectors=scene.mask_vectors[:0],
+        mask_areas=scene.mask_areas[:0],
+    )
+
+
+def for_language(parts: Parts) -> Parts:
+    """What a set of Gaussians for language alone is trained with.
+
+    Its one weight is the indicator, which therefore takes the opacity's place in pruning and resets; without colour there are
+    no harmonics, and no colour loss that densification could go by.
+    """
+    config = parts.gaussians
+    config = replace(
+        config,
+        color="rgb",
+        prune_on="indicator",
+        densify_on="total",
+        densify=replace(config.densify, reset_indicator=True),
+    )
+    indicator = parts.indicator if isinstance(parts.indicator, Fixed) else Learned()
+    return replace(parts, gaussians=config, indicator=indicator)
+
+
+@torch.no_grad()
+def unite(color: SplatModel, language: SplatModel) -> SplatModel:
+    """One model of both sets, whose images are theirs bit for bit: in the other modality a Gaussian weighs exactly nothing.
+
+    Args:
+        color: Renders colour.
+        language: Renders language; not fused.
+    """
+    ours, theirs = dict(color.splats), dict(language.splats)
+    n, m = color.count, language.count
+    theirs["shN"] = ours["shN"].new_zeros(m, *ours["shN"].shape[1:])
+    theirs["opacity_logits"] = torch.full((m,), NOWHERE)
+    ours["indicator_logits"] = torch.full((n,), NOWHERE)
+    ours["features"] = torch.zeros(n, theirs["features"].shape[1])
+    if isinstance(language.indicator, Fixed):
+        theirs["indicator_logits"] = torch.full((m,), language.indicator.value).logit()
+    both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in PARAMETERS}
+    model = SplatModel(both, NoFusion(), Learned(), language.codec, color.raster, color.sh_degree)
+    model.splats = nn.ParameterDict({k: nn.Parameter(v, False) for k, v in both.items()})
+    return model

@@ -1,0 +1,138 @@
+"""Which models a run trains, one after the other, and what they make together.
+
+Most runs train one model in the folder of the run. Others train several, each in a sub-folder with a checkpoint and a curve of its
+own; a stage that is done is read back from its checkpoint, so that the same command goes on wherever it was stopped.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from vlgs.gaussians import Sharing
+from vlgs.module.augment import NoAugment, Offline
+from vlgs.module.build import Parts, build_module
+from vlgs.module.fit import FitOptions, fit
+from vlgs.module.separate import for_language, unite, without_language
+from vlgs.module.skips import SkipCount
+from vlgs.render.model import SplatModel
+from vlgs.runs import RunFolder
+from vlgs.types import Scene
+
+AUGMENT = "augment"
+"""Name of the model that renders further training views."""
+
+
+class StoppedError(Exception):
+    """Training was asked to stop; what was reached is saved."""
+
+    def __init__(self, signal: str, where: str) -> None:
+        super().__init__(f"{signal}: stopped and saved at {where}")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One trained model."""
+
+    folder: RunFolder
+    model: SplatModel
+    seconds: float
+    """Of training."""
+    skips: SkipCount
+
+
+@dataclass
+class Stages:
+    """Trains models in sub-folders of a run.
+
+    Args:
+        folder: Of the run.
+        make_parts: Fresh parts, which hold weights; called once per model, with the same random numbers each time.
+        make_options: Likewise, as loggers belong to one training.
+        seed: Of the run.
+    """
+
+    folder: RunFolder
+    make_parts: Callable[[], Parts]
+    make_options: Callable[[], FitOptions]
+    seed: int
+    done: dict[str, Stage] = field(default_factory=dict)
+    """Name -> stage, in the order of training."""
+
+    @property
+    def kept(self) -> list[Stage]:
+        """What the result is made of: all but the model that only rendered further views."""
+        return [stage for name, stage in self.done.items() if name != AUGMENT]
+
+    def train(self, name: str, scene: Scene, color: bool = True) -> SplatModel:
+        """Train a model, or read it back.
+
+        Args:
+            name: Sub-folder; empty for the folder of the run itself.
+            scene: What it learns.
+            color: Off: language alone.
+
+        Raises:
+            StoppedError: If it was asked to stop.
+        """
+        folder = RunFolder(self.folder.path / name)
+        parts = self.make_parts()
+        module = build_module(scene, parts if color else for_language(parts), self.seed, color)
+        stopped_by = fit(module, folder, self.make_options())
+        if stopped_by is not None:
+            stage = f" of {name}" if name else ""
+            where = f"step {module.next_step} of {module.settings.iterations}{stage}"
+            raise StoppedError(stopped_by, where)
+        self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips)
+        return module.model
+
+
+def train_all(
+    stages: Stages,
+    scenes: Mapping[int | None, Scene],
+    sharing: Sharing,
+    augment: Offline | NoAugment,
+) -> list[SplatModel]:
+    """Train everything that a run is made of.
+
+    Args:
+        stages: Where and with what.
+        scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate``.
+        sharing: Whether colour and language are one model.
+        augment: Further training views, rendered from a first model of colour alone (systems.md D.17); what `Offline.require`
+            asks for is there.
+
+    Returns:
+        One model per level, in their order; one alone if there is no language.
+
+    Raises:
+        StoppedError: If training was asked to stop.
+    """
+    if not any(len(scene.mask_vectors) for scene in scenes.values()):
+        scenes = dict(list(scenes.items())[-1:])
+    if isinstance(augment, Offline):
+        first = stages.train(AUGMENT, without_language(next(iter(scenes.values()))))
+        maps = stages.folder.path / AUGMENT / "language"
+        scenes = augment.extend(scenes, first, stages.seed, maps)
+    models, color = [], None
+    for level, scene in scenes.items():
+        name = f"level_{level}" if len(scenes) > 1 else ""
+        if sharing.means:
+            models.append(stages.train(name, scene))
+            continue
+        color = color or stages.train("color", without_language(scene))
+        if len(scene.mask_vectors) == 0:
+            models.append(color)
+        else:
+            language = stages.train("/".join(filter(None, [name, "language"])), scene, color=False)
+            models.append(unite(color, language))
+    return models
+
+
+def all_skips(stages: Iterable[Stage]) -> SkipCount:
+    """What all stages left out together."""
+    total = SkipCount()
+    for stage in stages:
+        for name, work in stage.skips.work.items():
+            total.add(name, work.done, work.seconds)
+        for name, count in stage.skips.skipped.items():
+            total.skip(name, count)
+    return total
