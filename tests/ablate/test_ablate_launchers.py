@@ -97,7 +97,7 @@ def ray_address(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     head = {"num_cpus": 1, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     cluster.add_node(num_cpus=1)
-    yield cluster.address
+    yield str(cluster.address)
     ray.shutdown()
     cluster.shutdown()
 

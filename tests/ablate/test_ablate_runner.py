@@ -267,3 +267,25 @@ def test_a_run_is_told_its_scene_unless_the_folder_is_the_scene(
 ):
     runs = plan([table], Benchmark("b", overrides, scenes, (0,)))
     assert {any(o.startswith("data.scene=") for o in run.overrides) for run in runs} == {told}
+
+
+def test_runs_that_were_never_started_are_not_given_up(table: Table):
+    run = plan([table], Benchmark("b", ("data=synthetic",), ("glassware",), (0,)))[0]
+    tally = runner.Tally()
+    for _ in range(2 * runner.TRIES):
+        tally.add(run, Outcome())
+    assert not tally.failed
+    for _ in range(runner.TRIES):
+        tally.add(run, Outcome(None, 1.0, "begun.log"))
+    assert "its worker died" in tally.failed[run.name]
+
+
+def test_a_launcher_that_starts_nothing_is_an_error(
+    table: Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def broken(*_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(job, "run_and_record", broken)
+    with pytest.raises(ValueError, match="launcher must start jobs, got OSError: no space left"):
+        ablate(request_of(table, tmp_path / "r"))

@@ -129,8 +129,8 @@ class Tally:
     lost: Counter[str] = field(default_factory=Counter)
 
     def add(self, run: PlannedRun, outcome: Outcome) -> None:
-        """Judge one outcome of a run that had no results before it."""
-        if outcome.busy:
+        """Judge one outcome of a run that had no results before it; one that was never started has done nothing wrong."""
+        if outcome.busy or not outcome.log:
             return
         if outcome.lost:
             self.lost[run.name] += 1

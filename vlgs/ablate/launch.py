@@ -9,6 +9,7 @@ from hydra._internal.callbacks import Callbacks
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
+from hydra.core.utils import JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 
@@ -45,7 +46,7 @@ def launch(
     own = [f"hydra.sweep.dir={folder.resolve()}", "hydra.sweep.subdir=."]
     quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
     jobs = [[*command, place] for command in commands]
-    trouble: BaseException | None = None
+    trouble: Exception | None = None
     with initialize_config_dir(str(CONF), version_base="1.3"):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
@@ -68,15 +69,17 @@ def launch(
             ) from error
         state = Singleton.get_state()
         try:
-            launcher.launch(jobs, initial_job_idx=first)
+            for done in launcher.launch(jobs, initial_job_idx=first):
+                if done.status == JobStatus.FAILED:  # before its run began: no disk, no module
+                    trouble = done._return_value
         except Exception as error:  # launchers are other people's code: every one has errors of its own for a lost worker
             trouble = error
         finally:
             Singleton.set_state(state)
     outcomes = [read_outcome(folder, first + index) for index in range(len(jobs))]
+    said = f"{type(trouble).__name__}: {str(trouble).strip().partition(chr(10))[0]}"
+    if not any(outcome.log for outcome in outcomes):
+        raise ValueError(f"ablate: the launcher must start jobs, got {said}") from trouble
     if trouble is not None:
-        said = f"{type(trouble).__name__}: {str(trouble).strip().partition(chr(10))[0]}"
-        if not any(outcome.log for outcome in outcomes):
-            raise ValueError(f"ablate: the launcher must start jobs, got {said}") from trouble
         log.warning("the launcher lost a worker (%s)", said)
     return outcomes

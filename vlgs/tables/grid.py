@@ -127,8 +127,8 @@ def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Lin
                 if math.isfinite(lines[i].entries[column].mean)
             }
             best = sorted(set(printed.values()), reverse=quantity.higher_is_better)[:2]
-            if len(printed) < 2:
-                continue
+            if len(best) < 2:
+                continue  # nothing to compare, or all alike
             for i, value in printed.items():
                 if value in best:
                     ranked[i, column] = best.index(value) + 1

@@ -57,7 +57,9 @@ def write_report(
     )
     text = page.render(
         name=folder.name,
-        tables=[_section(table, keep(table.table.label, plots.bars(table))) for table in filled],
+        tables=[
+            _section(table, keep(table.table.label, plots.rows_compared(table))) for table in filled
+        ],
         whole=[(title, keep(name, png)) for title, name, png in whole if png is not None],
         provenance=provenance(filled[0]) if filled else [],
     )

@@ -1,4 +1,4 @@
-"""Pictures of the report: a bar chart per table, run time against mIoU, learning curves, l - o by kind. Matplotlib, no display."""
+"""Pictures of the report: the rows of a table, run time against mIoU, learning curves, l - o by kind. Matplotlib, no display."""
 
 import io
 import math
@@ -27,7 +27,7 @@ COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bb
 """Told apart by colour-blind eyes too (Tol's bright scheme)."""
 
 
-def bars(filled: Filled) -> bytes | None:
+def rows_compared(filled: Filled) -> bytes | None:
     """First metric of every row, with the deviation over seeds; by scene tables show their average, or their only scene.
 
     Returns:
@@ -46,7 +46,7 @@ def bars(filled: Filled) -> bytes | None:
     if not lines:
         return None
     with _png(6.4, 0.6 + 0.16 * len(lines) * max(len(series), 1.6)) as (axes, file):
-        _draw_bars(axes, lines, series, grid.headers)
+        _draw(axes, lines, series, grid.headers)
         quantity = QUANTITIES[metric]
         axes.set_xlabel(
             f"{quantity.header} ({quantity.unit})" if quantity.unit else quantity.header
@@ -143,28 +143,26 @@ def _png(width: float, height: float) -> Iterator[tuple[Axes, io.BytesIO]]:
         figure.savefig(file, format="png", dpi=110, metadata={"Software": None})
 
 
-def _draw_bars(
-    axes: Axes, lines: Sequence[Line], series: Sequence[int], headers: Sequence[str]
-) -> None:
-    height = 0.8 / len(series)
+def _draw(axes: Axes, lines: Sequence[Line], series: Sequence[int], headers: Sequence[str]) -> None:
+    """Points with error bars: rows lie close together, and a bar that does not start at zero misleads."""
     for number, index in enumerate(series):
         entries = [line.entries[index] for line in lines]
-        axes.barh(
-            [i + (number - (len(series) - 1) / 2) * height for i in range(len(lines))],
+        shift = 0.5 * ((number + 0.5) / len(series) - 0.5)
+        axes.errorbar(
             [entry.mean for entry in entries],
-            height,
+            [i + shift for i in range(len(lines))],
             xerr=[0.0 if math.isnan(entry.std) else entry.std for entry in entries],
+            fmt="o",
+            markersize=4,
+            elinewidth=0.8,
             color=COLORS[number % len(COLORS)],
-            error_kw={"elinewidth": 0.8},
             label=headers[index],
         )
     axes.set_yticks(range(len(lines)), [_title(line) for line in lines])
     axes.invert_yaxis()
-    means = [line.entries[i].mean for line in lines for i in series]
-    shown = [mean for mean in means if math.isfinite(mean)]
-    if min(shown) > 0 and max(shown) < 2 * min(shown):  # close together: do not start at zero
-        axes.set_xlim(left=min(shown) - 0.5 * (max(shown) - min(shown)) - 0.02 * max(shown))
+    axes.grid(axis="both", linewidth=0.3)
 
 
 def _title(line: Line) -> str:
-    return f"{line.group.partition(':')[0]}: {line.label}" if line.group else line.label
+    letter, colon, _ = line.group.partition(":")
+    return f"{letter}: {line.label}" if colon else line.label
