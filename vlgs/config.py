@@ -164,10 +164,19 @@ def _moving(config: DictConfig) -> dict[str, Any]:
     kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
     if isinstance(kept.get("codec"), dict):
         kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
+    kept.pop("features", None)  # what it says stands in `augment` too
+    if "augment" in kept:
+        kept["augment"] = _without(kept["augment"], frozenset({"weights", "device"}))
     for group, key in GIVEN_FILES:
         if isinstance(kept.get(group), dict):
             kept[group] = {k: v for k, v in kept[group].items() if k != key}
     return kept
+
+
+def _without(node: Any, keys: frozenset[str]) -> Any:
+    if isinstance(node, dict):
+        return {key: _without(value, keys) for key, value in node.items() if key not in keys}
+    return node
 
 
 def _digest(content: dict[str, Any]) -> str:

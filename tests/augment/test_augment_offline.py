@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_runs import TINY, composed
 
-from vlgs.config import instantiate
+from vlgs.config import instantiate, run_id
 from vlgs.features.extractor import MaskFeatures
 from vlgs.geometry import camera_center
 from vlgs.module.augment import Offline
@@ -113,7 +113,7 @@ def test_an_extractor_describes_the_rendered_images_once_for_all_levels(
     photographs, halves = replace(tiny_scene, supervise=None), Halves()
     augment = Offline(views=2, extractor=halves)
     assert augment.identity() == "[('halves', '1')]"
-    both = {2: photographs, 3: photographs}
+    both: dict[int | None, Scene] = {2: photographs, 3: photographs}
     augment.extend(both, model, 0, tmp_path / "maps")
     extended = augment.extend(both, model, 0, tmp_path / "maps")  # taken up again
     assert halves.asked == ["extra_00001", "extra_00002"]
@@ -138,6 +138,15 @@ def test_missing_weights_are_named_before_training():
     augment = instantiate(composed("augment=offline_sam", "features.weights=/nowhere").augment)
     with pytest.raises(FileNotFoundError, match="sam"):
         augment.identity()
+
+
+def test_where_weights_lie_moves_no_run():
+    def named(*overrides: str) -> str:
+        return run_id(composed("augment=offline_sam", *overrides), "data")
+
+    assert named("features.weights=/a") == named("features.weights=/b", "features.device=cuda")
+    assert named() != named("features.dtype=bfloat16")
+    assert named() != run_id(composed("augment=offline"), "data")
 
 
 def test_neighbours_are_the_nearest_of_one_size(tiny_scene: Scene):

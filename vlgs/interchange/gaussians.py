@@ -30,7 +30,7 @@ class Imported:
     """Gaussians from a file."""
 
     params: Mapping[str, Tensor]
-    """All of `vlgs.gaussians.PARAMETERS`."""
+    """All of `vlgs.gaussians.PARAMETERS`, and `LANGUAGE_SHAPE` where the file has it."""
     has_language: bool
     """Whether the features came from the file."""
     langsplat: bool
@@ -103,4 +103,6 @@ def _lost(imported: Imported, name: str) -> list[str]:
         lost.append("language features")
     if name != "vlgs" and not params["indicator_logits"].equal(params["opacity_logits"]):
         lost.append("indicators")
+    if name != "vlgs" and "language_quats" in params:
+        lost.append("covariances of language's own")
     return lost

@@ -4,6 +4,7 @@ Most runs train one model in the folder of the run. Others train several, each i
 own; a stage that is done is read back from its checkpoint, so that the same command goes on wherever it was stopped.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -16,6 +17,8 @@ from vlgs.module.skips import SkipCount
 from vlgs.render.model import SplatModel
 from vlgs.runs import RunFolder
 from vlgs.types import Scene
+
+log = logging.getLogger(__name__)
 
 AUGMENT = "augment"
 """Name of the model that renders further training views."""
@@ -74,6 +77,8 @@ class Stages:
             StoppedError: If it was asked to stop.
         """
         folder = RunFolder(self.folder.path / name)
+        if name:
+            log.info("model %s of this run, in %s", name, folder.path)
         parts = self.make_parts()
         module = build_module(scene, parts if color else for_language(parts), self.seed, color)
         stopped_by = fit(module, folder, self.make_options())

@@ -62,7 +62,10 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
         notes.append(Text(told, style="yellow"))
     width = max((len(label) for label in paths), default=0)
     places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
-    return Group(table, *notes, Text(f"protocol: {metrics['protocol']}"), *places)
+    told = [f"protocol: {metrics['protocol']}"]
+    if metrics.get("levels"):
+        told.append(f"mask levels: {', '.join(map(str, metrics['levels']))}")
+    return Group(table, *notes, *map(Text, told), *places)
 
 
 def _skipped(entry: Mapping[str, Any]) -> str:
