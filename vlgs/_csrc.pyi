@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from torch import Tensor
 
 def isa() -> str:
-def multiply_adds(packs: int) -> int: ...
     """The instruction set in use: ``v4`` (AVX-512), ``v3`` (AVX2) or ``base``; lowered by the environment's VLGS_ISA."""
+
+def multiply_adds(packs: int) -> int: ...
 
 class Camera:
     def __init__(

@@ -210,8 +210,9 @@ class TwoGaussians(FakeModel):
     def fuse(self) -> FakeFused:
         fused = super().fuse()
         codes = vocabulary(CLASSES).vectors[[3, 4]]
-        two = {key: value[:2] for key, value in vars(fused.gaussians).items()} | {"features": codes}
-        return FakeFused(Gaussians(**two), torch.tensor([0.9, 0.8]))
+        two = {k: v[:2] for k, v in vars(fused.gaussians).items() if isinstance(v, torch.Tensor)}
+        two["features"] = codes
+        return FakeFused(Gaussians(**two), torch.tensor([0.9, 0.8]))  # pyright: ignore[reportArgumentType]
 
     def render_values(self, camera: Camera, values: torch.Tensor, weight: torch.Tensor):
         ids = self._drawing(camera).ids
