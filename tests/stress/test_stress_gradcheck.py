@@ -65,6 +65,7 @@ NO_GRADIENT = {
     "vlgs.gaussians.ply.read_ply": "from a file",
     "vlgs.gaussians.ply.parse_ply": "from a file",
     "vlgs.gaussians.parameters.complete": "fills a file's gaps",
+    "vlgs.gaussians.parameters.with_language_shape": "placed once",
     "vlgs.gaussians.sound.broken_rows": "a mask",
     "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
     "vlgs.render.frustum.may_see": "a mask",
@@ -142,11 +143,20 @@ def parameters() -> dict[str, Tensor]:
         "means": s.means, "quats": s.quats, "log_scales": s.scales.log(), "sh0": draw(4, 3, seed=1),
         "shN": 0.1 * draw(4, 15, 3, seed=2), "opacity_logits": draw(4, seed=3),
         "indicator_logits": draw(4, seed=4), "features": draw(4, 3, seed=5),
+        "language_quats": draw(4, 4, seed=6), "language_log_scales": draw(4, 3, seed=7),
     }  # fmt: skip
 
 
 def activated(*values: Tensor) -> Gaussians:
     return activate(dict(zip(parameters(), values, strict=True)))
+
+
+def tensors(gaussians: Gaussians) -> tuple[Tensor, ...]:
+    """All that a set of Gaussians holds."""
+    shape = gaussians.language_shape
+    assert shape is not None
+    own = (value for value in vars(gaussians).values() if isinstance(value, Tensor))
+    return (*own, *vars(shape).values())
 
 
 def model(read: Callable[[SplatModel], object]) -> Check:
@@ -207,7 +217,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.render.frozen.FrozenView.render": frozen,
     "vlgs.render.model.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
     "vlgs.render.model.SplatModel.gaussians": lambda: model(
-        lambda m: tuple(vars(m.gaussians()).values())
+        lambda m: tensors(m.gaussians())
     ),
     "vlgs.render.model.SplatModel.fuse": lambda: model(lambda m: (m.fuse().color, m.fuse().feature)),
     "vlgs.render.model.SplatModel.render": lambda: model(
@@ -246,7 +256,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.fusion.blocks.from_blocks": lambda: (lambda x: from_blocks(x.expand(2, 2, BLOCK), 3), [draw(2, 2, 1)]),
     "vlgs.fusion.blocks.linear": lambda: (partial(linear, LAYER), [draw(2, 2, 4)]),
     "vlgs.gaussians.parameters.activate": lambda: (
-        lambda *v: tuple(vars(activated(*v)).values()), list(parameters().values())
+        lambda *v: tensors(activated(*v)), list(parameters().values())
     ),
     "vlgs.gaussians.sh.sh_to_rgb": lambda: (sh_to_rgb, [draw(4, 3)]),
     "vlgs.gaussians.sh.rgb_to_sh": lambda: (rgb_to_sh, [draw(4, 3)]),

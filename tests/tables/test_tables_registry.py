@@ -24,18 +24,7 @@ def runnable_rows() -> list[tuple[str, ...]]:
     )
 
 
-def rows_with_what_is_missing() -> list:
-    """The axes `sharing` and `augment` are not built yet; when they are, the strict mark says so."""
-    missing = pytest.mark.xfail(strict=True, reason="axis not built yet")
-    return [
-        pytest.param(row, marks=missing, id=" ".join(row))
-        if any(o.startswith(("sharing=", "augment=")) for o in row)
-        else pytest.param(row, id=" ".join(row))
-        for row in runnable_rows()
-    ]
-
-
-@pytest.mark.parametrize("overrides", rows_with_what_is_missing())
+@pytest.mark.parametrize("overrides", runnable_rows(), ids=" ".join)
 def test_every_row_is_a_configuration(overrides: tuple[str, ...]):
     benchmark = Benchmark("synthetic", ("data=synthetic",), ("glassware",), (0,))
     full = Composer(benchmark).identity((), 0)

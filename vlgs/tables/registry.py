@@ -110,7 +110,7 @@ def load_table(path: Path) -> Table:
         ValueError: Names the file, the key and what it must be.
     """
     try:
-        content = yaml.load(path.read_text(), _LOADER)
+        content = _LOADER(path.read_text()).get_single_data()
     except yaml.YAMLError as error:
         raise ValueError(f"{path}: must be YAML, got: {error}") from error
     where = str(path)
