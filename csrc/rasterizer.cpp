@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <limits>
 #include <stdexcept>
 #include <string>
 
@@ -101,7 +102,12 @@ typename Blend<T>::Stage Blend<T>::make_stage(int first_chain, int num_chains) c
   s.first_chain = first_chain;
   Pass<T> &p = s.pass;
   p.grid = grid_;
-  p.alpha_max = T(config_.alpha_max), p.transmittance_min = T(config_.transmittance_min);
+  p.alpha_max = T(config_.alpha_max);
+  // Backward recovers the light in front of a Gaussian by dividing what is left behind it: where that leaves
+  // the range of normal numbers its digits are gone. No value is visible behind so little light.
+  const T least =
+      std::numeric_limits<T>::min() / std::max(T(1) - p.alpha_max, std::numeric_limits<T>::epsilon());
+  p.transmittance_min = std::max(T(config_.transmittance_min), least);
   p.stop_before = config_.stop_before;
   p.chains = num_chains;
   for (int c = 0; c < num_chains; ++c) {
