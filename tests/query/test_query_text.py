@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tiny_models import save_clip
 
 from vlgs.query import LerfRelevancy, TextEncoder, VocabSoftmax, encode_prompts
 from vlgs.query.text import ClipText, VocabularyText
@@ -67,25 +68,10 @@ def test_no_prompts_are_refused():
 @pytest.fixture(scope="module")
 def clip_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A CLIP model of a few thousand random weights and a tokenizer of single letters."""
-    from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
-
     folder = tmp_path_factory.mktemp("clip")
-    letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
-    tokens = [*letters, *(f"{c}</w>" for c in letters), "<|startoftext|>", "<|endoftext|>"]
-    tokenizer = CLIPTokenizer(vocab={t: i for i, t in enumerate(tokens)}, merges=[])
-    tokenizer.save_pretrained(folder)
-    small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1}
-    config = CLIPConfig(
-        text_config={
-            **small, "num_attention_heads": 2, "vocab_size": len(tokens),
-            "bos_token_id": 52, "eos_token_id": 53, "pad_token_id": 53,
-        },
-        vision_config={**small, "num_attention_heads": 2, "image_size": 8, "patch_size": 4},
-        projection_dim=12,
-    )  # fmt: skip
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        CLIPModel(config).save_pretrained(folder)
+        save_clip(folder)
     return folder
 
 

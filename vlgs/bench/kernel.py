@@ -23,7 +23,7 @@ ISAS = ("v4", "v3", "base")
 """Instruction sets of the kernel, best first: AVX-512, AVX2, baseline."""
 
 REFERENCE_BYTES = 80
-"""Memory of the dense reference and its gradients per Gaussian, pixel and pair of groups, bytes: measured 70 to 76."""
+"""Memory of the dense reference and its gradients per Gaussian, pixel and pair of groups, bytes: an estimate, not measured."""
 
 
 class Size(NamedTuple):
