@@ -119,7 +119,9 @@ def instantiate(config: Any, **arguments: Any) -> Any:
 RESULTS_VERSION = 2
 """Part of every run id; raised by a change that can move a number."""
 
-PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "cache_bytes", "scene"})
+PLACES = frozenset(
+    {"root", "labels", "features", "vocabulary", "release", "cache_bytes", "cache", "scene"}
+)
 """Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
 
 

@@ -68,7 +68,7 @@ def test_every_scene_loads(name, difficulty):
 
 def test_the_same_arguments_give_the_same_bits():
     first = load_scene(**SMALL)
-    studio._shoot.cache_clear()
+    studio._open.cache_clear()
     again = load_scene(**SMALL)
     assert first.fingerprint == again.fingerprint
     assert torch.equal(first.points, again.points)
@@ -104,6 +104,32 @@ def test_a_fault_written_out_is_the_same_as_the_preset():
     written = Recipe(**SMALL, faults=Faults(missed=0.05))
     assert written.fingerprint(3) == Recipe(**SMALL).fingerprint(3)
     assert load_scene(**SMALL).fingerprint == written.fingerprint(3)
+
+
+def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, caplog):
+    cached: dict[str, Any] = SMALL | {"cache": str(tmp_path / "cache")}
+
+    def same(first: Scene, second: Scene) -> bool:
+        pairs = zip(first.train + first.test, second.train + second.test, strict=True)
+        return torch.equal(first.points, second.points) and all(
+            torch.equal(a.read_image(), b.read_image()) and torch.equal(ids(a), ids(b))
+            for a, b in pairs
+        )
+
+    traced = load_scene(**SMALL)
+    assert same(traced, load_scene(**cached))
+    assert same(load_scene(**cached, points=7), load_scene(**SMALL, points=7))
+    [file] = (tmp_path / "cache").iterdir()
+
+    studio._open.cache_clear()  # as another process would begin
+    monkeypatch.setattr(studio, "photograph", lambda *_: pytest.fail("traced again"))
+    assert same(traced, load_scene(**cached))
+
+    monkeypatch.undo()
+    studio._open.cache_clear()
+    file.write_bytes(file.read_bytes()[:1000])
+    assert same(traced, load_scene(**cached))
+    assert "could not be read" in caplog.text
 
 
 def test_readers_hand_out_values_that_nobody_can_spoil(scene):
@@ -209,6 +235,8 @@ def test_configuration_mirrors_the_function():
     assert Faults(**faults) == Faults()
     defaults = {name: p.default for name, p in inspect.signature(load_scene).parameters.items()}
     assert defaults.pop("faults") == Faults()
+    assert config.pop("cache") == "${results}/cache"
+    assert defaults.pop("cache") is None
     assert config == defaults
     assert Recipe() == Recipe(**{k: v for k, v in defaults.items() if k != "level"})
 

@@ -2,6 +2,7 @@
 
 import zlib
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -31,8 +32,9 @@ def load_scene(
     points: int = 4000,
     level: int = 3,
     faults: Faults = Faults(),  # noqa: B008 (frozen)
+    cache: str | None = None,
 ) -> Scene:
-    """A procedural scene, rendered now and held in memory.
+    """A procedural scene, ray-traced and held in memory.
 
     The same arguments give the same bits on one machine. See `vlgs.data.synthetic` for what the scenes are.
 
@@ -47,6 +49,7 @@ def load_scene(
         points: Sparse points drawn; about a tenth is lost on glass and steel.
         level: Mask level of the supervision: 0 default, 1 subpart, 2 part, 3 whole.
         faults: How the supervision errs.
+        cache: Folder that keeps the photographs, so that the next process need not trace them; None: nothing is kept.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -54,9 +57,10 @@ def load_scene(
     if level not in range(4):
         raise ValueError(f"synthetic: level must be 0, 1, 2 or 3, got {level}")
     recipe = Recipe(scene, difficulty, width, height, train_views, test_views, seed, points, faults)
-    studio = open_studio(recipe)
+    folder = None if cache is None else Path(cache)
+    studio = open_studio(recipe, folder)
     indices, vectors, offset = {}, [], 0
-    for name, levels in language_levels(recipe).items():
+    for name, levels in language_levels(recipe, folder).items():
         masks = levels[level]
         indices[name] = np.where(masks.index >= 0, masks.index + offset, -1).astype(np.int32)
         vectors.append(masks.vectors)
@@ -80,27 +84,27 @@ def load_scene(
         classes=studio.classes,
         class_kinds={thing.name: thing.kind for thing in studio.world.things},
         vocabulary=vocabulary(studio.classes),
-        supervise=lambda camera, number: _supervise(recipe, level, camera, number),
+        supervise=lambda camera, number: _supervise(recipe, folder, level, camera, number),
         fingerprint=recipe.fingerprint(level),
     )
 
 
 def language_levels(
-    recipe: Recipe,
+    recipe: Recipe, cache: Path | None = None
 ) -> Mapping[str, tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]]:
     """Supervision of every training view at levels 0 to 3, by view name; what `write_scene` puts on disk."""
-    studio = open_studio(recipe)
+    studio = open_studio(recipe, cache)
     return {shot.name: _levels(recipe, studio, shot.photo, shot.number) for shot in studio.train}
 
 
 def _supervise(
-    recipe: Recipe, level: int, camera: Camera, number: int
+    recipe: Recipe, cache: Path | None, level: int, camera: Camera, number: int
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]]:
     """What stands in for SAM and CLIP on a rendered image: the exact regions at that camera, spoilt like those of a photograph.
 
     Real extractors would also stumble over the faults of the render.
     """
-    studio = open_studio(recipe)
+    studio = open_studio(recipe, cache)
     photo = photograph(studio.world, camera)
     masks = _levels(recipe, studio, photo, MAX_VIEWS + 1 + number)[level]
     return torch.from_numpy(masks.index.astype(np.int32)), torch.from_numpy(masks.vectors)

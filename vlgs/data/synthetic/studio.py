@@ -1,7 +1,11 @@
 """Photographs of a scene, taken once, and what its segmenters could find in them."""
 
 import functools
-from dataclasses import dataclass, replace
+import io
+import logging
+import zipfile
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
@@ -12,7 +16,10 @@ from vlgs.data.synthetic.masks import NO_FAULTS, Region
 from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.recipe import Recipe
 from vlgs.data.synthetic.world import World
+from vlgs.files import write_atomically
 from vlgs.types import Camera
+
+log = logging.getLogger(__name__)
 
 _LAYOUT, _WALK = 100, 101  # purposes of draws; `masks` and `scene` have others
 _PATCHES = 1 << 16
@@ -40,28 +47,35 @@ class Studio:
     test: tuple[Shot, ...]
 
 
-def open_studio(recipe: Recipe) -> Studio:
-    """Build and photograph; kept in memory, as sweeps over levels and faults ask for the same photographs again."""
-    return _shoot(replace(recipe, points=0, faults=NO_FAULTS))
+def open_studio(recipe: Recipe, cache: Path | None = None) -> Studio:
+    """Build and photograph, or find the photographs; sweeps over levels, faults and methods ask for the same ones again.
+
+    Args:
+        recipe: Of the scene; its points and faults do not matter here.
+        cache: Folder that keeps photographs between processes; None: they are kept in memory only.
+    """
+    return _open(replace(recipe, points=0, faults=NO_FAULTS), cache)
 
 
 @functools.lru_cache(maxsize=2)
-def _shoot(recipe: Recipe) -> Studio:
+def _open(recipe: Recipe, cache: Path | None) -> Studio:
     things = build(recipe.scene, recipe.difficulty, np.random.default_rng([_LAYOUT, recipe.seed]))
     world = World(things)
     classes = tuple(dict.fromkeys(thing.name for thing in things))
     class_of_thing = np.array([classes.index(thing.name) for thing in things], np.uint8)
     train, test = moments(recipe.train_views, recipe.test_views)
     order = np.argsort(np.argsort(np.concatenate([train, test])))
-    shots = []
+    places = []
     for position, moment in zip(
         order.tolist(), np.concatenate([train, test]).tolist(), strict=True
     ):
-        held_out = len(shots) >= recipe.train_views
-        number = len(shots) - recipe.train_views * held_out
+        held_out = len(places) >= recipe.train_views
+        number = len(places) - recipe.train_views * held_out
         rng = np.random.default_rng([_WALK, recipe.seed, int(held_out), number])
         camera = camera_at(moment, rng, recipe.width, recipe.height)
-        shots.append(Shot(f"frame_{position + 1:05d}", number, camera, photograph(world, camera)))
+        places.append((f"frame_{position + 1:05d}", number, camera))
+    photos = _photographs(world, [camera for *_, camera in places], recipe, cache)
+    shots = [Shot(n, k, c, photo) for (n, k, c), photo in zip(places, photos, strict=True)]
     return Studio(
         world,
         classes,
@@ -69,6 +83,30 @@ def _shoot(recipe: Recipe) -> Studio:
         tuple(shots[: recipe.train_views]),
         tuple(shots[recipe.train_views :]),
     )
+
+
+def _photographs(
+    world: World, cameras: list[Camera], recipe: Recipe, cache: Path | None
+) -> list[Photograph]:
+    if cache is None:
+        return [photograph(world, camera) for camera in cameras]
+    file = cache / f"studio-{recipe.fingerprint(level=0)}.npz"
+    names = [field.name for field in fields(Photograph)]
+    try:
+        with file.open("rb") as raw, np.load(raw) as kept:
+            stacks = [kept[name] for name in names]
+        return [Photograph(*arrays) for arrays in zip(*stacks, strict=True)]
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
+    photos = [photograph(world, camera) for camera in cameras]
+    content = io.BytesIO()
+    stacks = {name: np.stack([getattr(photo, name) for photo in photos]) for name in names}
+    np.savez(content, **stacks)  # pyright: ignore[reportArgumentType] (names are not allow_pickle)
+    cache.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, content.getvalue())
+    return photos
 
 
 def regions(
