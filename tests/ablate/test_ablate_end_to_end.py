@@ -9,7 +9,13 @@ import pytest
 from tiny_runs import TINY
 
 SHORT = [word for word in TINY if word != "progress=false"]
-SHORT += ["trainer=smoke", "trainer.iterations=20", "threads=1", "pictures=false"]
+SHORT += [
+    "trainer=smoke",
+    "data.difficulty=hard",
+    "trainer.iterations=20",
+    "threads=1",
+    "pictures=false",
+]
 
 
 @pytest.mark.slow

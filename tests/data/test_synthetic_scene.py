@@ -46,6 +46,7 @@ def scene() -> Scene:
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
 def test_every_scene_loads(name, difficulty):
     scene = load_scene(name, difficulty, **SMALL)
+    assert scene.name == name  # tables look runs up by data.scene
     assert (len(scene.train), len(scene.test)) == (4, 2)
     assert 10 <= len(scene.classes) <= 16
     assert set(scene.class_kinds) == set(scene.classes)

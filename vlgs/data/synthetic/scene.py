@@ -73,7 +73,7 @@ def load_scene(
         for shot, count in zip(studio.train, _shares(points, train_views), strict=True)
     ]
     return Scene(
-        name=scene if difficulty == "easy" else f"{scene}-{difficulty}",
+        name=scene,
         train=tuple(_view(studio, shot, indices[shot.name]) for shot in studio.train),
         test=tuple(_view(studio, shot, None) for shot in studio.test),
         split="synthetic",
