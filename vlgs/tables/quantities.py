@@ -20,6 +20,9 @@ class Quantity:
 
 QUANTITIES: dict[str, Quantity] = {
     "miou": Quantity("miou", "mIoU", "%", 100.0, 1, True),
+    "miou_translucent_reflective": Quantity(
+        "miou_translucent_reflective", "mIoU (glass, steel)", "%", 100.0, 1, True
+    ),
     "loc_acc": Quantity("loc_acc", "Accuracy", "%", 100.0, 1, True),
     "miou_lerf_ovs": Quantity("miou_lerf_ovs", "mIoU (LERF-OVS)", "%", 100.0, 1, True),
     "loc_acc_lerf_ovs": Quantity("loc_acc_lerf_ovs", "Accuracy (LERF-OVS)", "%", 100.0, 1, True),
