@@ -34,7 +34,7 @@ def fake_runs(
                     if (row.label, scene, seed) in skip:
                         continue
                     known = composer.identity(row.overrides or (), seed)
-                    name = f"{known.recipe[:8]}{scene}{seed}"
+                    name = f"{known.recipe[:8]}{known.data[:4]}{scene}{seed}"
                     names.add(name)
                     folder = results / "runs" / name
                     folder.mkdir(parents=True, exist_ok=True)

@@ -121,14 +121,18 @@ BENCHMARK = Benchmark("synthetic", ("data=synthetic",), ("glassware", "mirrors")
 def value(row: Row, scene: str, seed: int) -> float:
     """Scenes and seeds differ widely, so that only pairs show a difference."""
     offset = {"Worse": -0.05, "Better": 0.04, "Same": 0.03 * (-1) ** seed, "Ours": 0.02}
+    offset |= {"Clean full": 0.1}
     return 0.5 + (0.2 if scene == "mirrors" else 0.0) + 0.05 * seed + offset.get(row.label, 0.0)
 
 
 def filled_of(
-    tmp_path: Path, benchmark: Benchmark = BENCHMARK, skip: list[tuple[str, str, int]] | None = None
+    tmp_path: Path,
+    benchmark: Benchmark = BENCHMARK,
+    skip: list[tuple[str, str, int]] | None = None,
+    text: str = TABLE,
 ) -> Filled:
     path = tmp_path / "tiny.yaml"
-    path.write_text(TABLE)
+    path.write_text(text)
     table = load_table(path)
     fake_runs(tmp_path, [table], benchmark, value, skip=skip or [])
     return fill(table, benchmark, Composer(benchmark), tidy(read_metrics(tmp_path)))
@@ -153,6 +157,21 @@ def test_rows_are_judged_in_pairs(tmp_path: Path):
     want = scipys_tau([55, 60, 64, 61], [40, 50, 45, 48])
     assert order_agreement(filled, "miou") == pytest.approx(want)
     assert f"{want:+.2f}" in text
+
+
+def test_a_group_on_other_data_is_compared_with_its_own_full_model(tmp_path: Path):
+    other = "data.faults.noise=0"
+    more = f"""
+  - {{label: Worse, group: Clean, set: [fusion=none, {other}]}}
+  - {{label: Clean full, group: Clean, set: [{other}]}}
+"""
+    filled = filled_of(tmp_path, text=TABLE + more.lstrip("\n"))
+    differences = paired_differences(filled, "miou")
+    assert [(d.group, d.mean) for d in differences if d.label == "Worse"] == [
+        ("", pytest.approx(-5.0)),
+        ("Clean", pytest.approx(-15.0)),
+    ]
+    assert "Clean full" not in {d.label for d in differences}
 
 
 def test_pairs_without_a_partner_are_left_out(tmp_path: Path):

@@ -51,7 +51,7 @@ def paired_differences(filled: Filled, metric: str) -> list[Difference]:
     out = []
     for index, row in enumerate(table.rows):
         reference = _full_model(filled, row.group)
-        if reference is None or not row.overrides:
+        if reference is None or index == reference or not row.overrides:
             continue
         mine, full = numbers.get(index, {}), numbers.get(reference, {})
         pairs: dict[str, list[float]] = {}
@@ -183,9 +183,19 @@ def sentence(filled: Filled, metric: str) -> str:
 
 
 def _full_model(filled: Filled, group: str) -> int | None:
-    rows = [i for i, row in enumerate(filled.table.rows) if row.overrides == ()]
-    own = [i for i in rows if filled.table.rows[i].group == group]
-    return (own or rows or [None])[0]
+    rows = list(enumerate(filled.table.rows))
+    full = [i for i, row in rows if row.overrides == ()]
+    own = [i for i in full if filled.table.rows[i].group == group]
+    # A group on other data has a full model of its own: the row that changes nothing but the data.
+    moved = [
+        i
+        for i, row in rows
+        if group
+        and row.group == group
+        and row.overrides
+        and all(word.startswith("data.") for word in row.overrides)
+    ]
+    return (own or moved or full or [None])[0]
 
 
 def _ours(filled: Filled, row: int, metric: str) -> float:
