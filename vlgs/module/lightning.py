@@ -33,9 +33,11 @@ class Target:
 
     view: View
     image: Float[Tensor, "h w 3"]
-    codes: Float[Tensor, "h w d"] | None
-    valid: Bool[Tensor, "h w"] | None
-    """Pixels with a mask; None like `codes` where the view has no language."""
+    codes: Float[Tensor, "h wl d"] | None
+    """Language codes; with ``levels=joint`` those of the l mask levels of a pixel stand beside each other in its row, so that losses
+    and blending need not know of levels."""
+    valid: Bool[Tensor, "h wl"] | None
+    """Where there is a mask; None like `codes` where the view has no language."""
 
 
 @dataclass
@@ -169,9 +171,10 @@ class VLGSModule(L.LightningModule):
         if view.read_masks is None or not self.has_language:
             return Target(view, image, None, None)
         read = view.read_masks
-        # Row -1, "no mask", takes the zero code that stands last.
-        codes = kept.get((index, "codes"), lambda: self.mask_codes[read().long()])
-        return Target(view, image, codes, kept.get((index, "valid"), lambda: read() >= 0))
+        # Row -1, "no mask", takes the zero code that stands last. A pixel of several mask levels becomes as many pixels of a row.
+        codes = kept.get((index, "codes"), lambda: self.mask_codes[read().long()].flatten(1, -2))
+        valid = kept.get((index, "valid"), lambda: (read() >= 0).flatten(1))
+        return Target(view, image, codes, valid)
 
     def similarity(self, first: int, second: int) -> float:
         """SSIM(I1, I2), clamped at 0, computed once per pair."""
@@ -246,7 +249,8 @@ class VLGSModule(L.LightningModule):
     def _language_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.feature is None or target.codes is None:
             return torch.zeros(())
-        return self.losses.language_loss(render.feature, target.codes, target.valid)
+        feature = render.feature.view_as(target.codes)
+        return self.losses.language_loss(feature, target.codes, target.valid)
 
     def _backward(
         self, total: Tensor, color_losses: list[Tensor], renders: list[ViewRender]
@@ -307,7 +311,7 @@ class VLGSModule(L.LightningModule):
             with self.skips.doing("blended render"):
                 feature = self.model.render(plan.camera, color=False, fused=fused).feature
         assert feature is not None
-        return self.losses.blended_loss(feature, codes, valid, plan.similarity)
+        return self.losses.blended_loss(feature.view_as(codes), codes, valid, plan.similarity)
 
     def _color_mse(self, renders: list[ViewRender], targets: tuple[Target, ...]) -> float:
         with torch.no_grad():
