@@ -23,7 +23,7 @@ from vlgs.module.skips import SkipCount
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
-TARGET_BYTES = 512 << 20
+TARGET_BYTES = 128 << 20
 """Images and code maps kept as float32 for the losses: all views of a small scene, the latest ones of a large one."""
 
 
