@@ -102,9 +102,12 @@ def stages(root: Path, started: float) -> list[tuple[str, float, float, float]]:
 
 
 def _training(module: "VLGSModule") -> Iterator[tuple[str, Callable[[], object]]]:
+    def decode() -> None:
+        for index in range(len(module.scene.train)):
+            module.target(index)
+
     yield "first step", lambda: module.training_step(0, 0)
-    count = len(module.scene.train)
-    yield "every view decoded once", lambda: [module.target(i) for i in range(count)]
+    yield "every view decoded once", decode
     yield f"{STEPS} more steps", lambda: [module.training_step(i, 0) for i in range(1, STEPS + 1)]
 
 

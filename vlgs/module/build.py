@@ -82,8 +82,8 @@ def build_module(
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.means and not parts.sharing.covariances
     parameters = with_language_shape(parameters, own)
-    per_level = scene.mask_levels if isinstance(parts.indicator, PerLevel) else None
-    parameters = with_level_indicators(parameters, per_level)
+    several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
+    parameters = with_level_indicators(parameters, scene.mask_levels if several else None)
     evaluated = config.color == "evaluated"
     model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, 0, evaluated)
     module = VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
