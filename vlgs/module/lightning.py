@@ -23,8 +23,8 @@ from vlgs.module.skips import SkipCount
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
-TARGET_BYTES = 128 << 20
-"""Images and code maps kept as float32 for the losses: all views of a small scene, the latest ones of a large one."""
+TARGET_BYTES = 256 << 20
+"""Most memory for images and code maps kept as float32 for the losses: those of all views or, where they take more, of one iteration."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class VLGSModule(L.LightningModule):
         self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
-        self.target_cache = PixelCache(TARGET_BYTES)
+        self.target_cache = PixelCache(self._room_for_targets())
         freeze(model, tuple(trainer_config.freeze), gaussians_config.densify.stop)
         self.optimizer = self._make_optimizer()
         self.densify_state = DensifyState.zeros(model.count)
@@ -194,6 +194,13 @@ class VLGSModule(L.LightningModule):
         with torch.no_grad():
             codes = self.model.codec.encode(self.scene.mask_vectors)
         return torch.cat([codes, torch.zeros(1, codes.shape[1])])
+
+    def _room_for_targets(self) -> int:
+        """Bytes; a part of the views would be found again too seldom to be worth its memory."""
+        code = 4 * self.mask_codes.shape[1] + 1  # and whether it counts
+        pixel = 3 * 4 + (code * self.scene.mask_levels if self.has_language else 0)
+        views = [pixel * view.camera.width * view.camera.height for view in self.scene.train]
+        return sum(views) if sum(views) <= TARGET_BYTES else 2 * max(views)
 
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = self.settings.learning_rates
