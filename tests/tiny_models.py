@@ -56,6 +56,39 @@ def save_clip(folder: Path) -> None:
     (folder / "preprocessor_config.json").write_text(json.dumps(settings))
 
 
+def save_siglip(folder: Path, flexible: bool = False) -> None:
+    """SigLIP 2: of one image size, which transformers calls siglip, or its flexible kind, siglip2."""
+    from transformers import (
+        Siglip2Config,
+        Siglip2Model,
+        Siglip2Tokenizer,
+        SiglipConfig,
+        SiglipModel,
+    )
+
+    letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
+    tokens = ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>", "▁", *letters]
+    tokenizer = Siglip2Tokenizer(vocab={t: i for i, t in enumerate(tokens)}, merges=[])
+    tokenizer.save_pretrained(folder)
+    small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1}
+    text = {
+        **small, "num_attention_heads": 2, "vocab_size": len(tokens), "max_position_embeddings": 20,
+        "projection_size": 16,
+    }  # fmt: skip
+    vision = {**small, "num_attention_heads": 2, "patch_size": 4}
+    if flexible:
+        vision["num_patches"] = 16
+        model = Siglip2Model(Siglip2Config(text_config=text, vision_config=vision))
+    else:
+        vision["image_size"] = 16
+        model = SiglipModel(SiglipConfig(text_config=text, vision_config=vision))
+    with torch.no_grad():  # embeddings start so small that all words are one
+        model.text_model.embeddings.token_embedding.weight.normal_()
+    model.save_pretrained(folder)
+    settings = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "size": {"height": 16}}
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+
+
 def save_models(folder: Path) -> Path:
     """Both, under the names that `vlgs.features` looks for."""
     with torch.random.fork_rng():

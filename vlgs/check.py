@@ -11,7 +11,7 @@ from omegaconf.errors import MissingMandatoryValue
 from rich.console import Console
 from torch import Tensor
 
-from vlgs.config import CONF, check_targets, instantiate
+from vlgs.config import CONF, LEVELS, check_targets, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
 from vlgs.data.plausible import plausibility_warnings
@@ -137,7 +137,8 @@ def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
     gaussians = config.gaussians
     geometry, weights = 3 + 4 + 3, 2  # means, quats, scales; opacity and indicator
     parameters = geometry + weights + 3 * (gaussians.sh_degree + 1) ** 2
-    parameters += OmegaConf.select(config, "codec.dim", default=512)
+    levels = len(LEVELS) if config.get("levels") == "joint" else 1
+    parameters += levels * OmegaConf.select(config, "codec.dim", default=512)
     needed = gaussians.max_count * parameters * 4 * 4
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     line = f"training    {needed / 2**20:.0f} MiB for {gaussians.max_count} Gaussians at most, with their optimiser"

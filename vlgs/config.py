@@ -35,9 +35,18 @@ NOT_PART_OF_A_RUN = frozenset(
 not depend on the folder that its data lies in."""
 
 LEVELS = (1, 2, 3)
-"""Mask levels of ``levels=separate``: subpart, part, whole, finest first (systems.md D.8)."""
+"""Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (systems.md D.8)."""
+
+OmegaConf.register_new_resolver(
+    "code_channels",
+    lambda levels, width: width * (len(LEVELS) if levels == "joint" else 1),
+    replace=True,
+)
+"""``${code_channels:${levels},${codec.dim}}``: language channels of a Gaussian, which is what a fusion is built for."""
 
 _NO_FUSION = "vlgs.fusion.none.NoFusion"
+_PER_LEVEL = "vlgs.indicator.PerLevel"
+_NOT_LEARNED = ("vlgs.indicator.ColourOpacity", "vlgs.indicator.Fixed")
 
 GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
@@ -58,12 +67,23 @@ def check_config(config: DictConfig) -> None:
             raise ValueError(f"config: {key} must be an integer of at least {least}, got {value}")
     if config.on_existing not in ("resume", "refuse"):
         raise ValueError(f"config: on_existing must be resume or refuse, got {config.on_existing}")
-    if config.levels not in ("single", "separate"):
-        raise ValueError(f"config: levels must be single or separate, got {config.levels}")
-    if config.levels == "separate" and "level" not in config.data:
+    if config.levels not in ("single", "separate", "joint"):
+        raise ValueError(f"config: levels must be single, separate or joint, got {config.levels}")
+    if config.levels != "single" and "level" not in config.data:
         raise ValueError(
-            "config: data must have mask levels with levels=separate, got no data.level"
+            f"config: data must have mask levels with levels={config.levels}, got no data.level"
         )
+    if config.indicator._target_ == _PER_LEVEL and config.levels != "joint":
+        raise ValueError(
+            f"config: levels must be joint with indicator=per_level, got {config.levels}"
+        )
+    if config.sharing.get("lifted", False):
+        for group, targets in (("fusion", (_NO_FUSION,)), ("indicator", _NOT_LEARNED)):
+            if config[group]._target_ not in targets:
+                raise ValueError(
+                    f"config: {group} must be {' or '.join(targets)} with sharing=lifted, as nothing trains it, "
+                    f"got {config[group]._target_}"
+                )
     if not config.sharing.get("means", True) and config.fusion._target_ != _NO_FUSION:
         raise ValueError(
             "config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, "

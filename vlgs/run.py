@@ -77,7 +77,7 @@ def run(config: DictConfig) -> int:
 
 
 def _scenes(config: DictConfig) -> dict[int | None, Any]:
-    """Mask level -> scene; the last one, of whole objects with ``levels=separate``, stands for what they share."""
+    """Mask level -> scene; the last one, of whole objects where there are several, stands for what they share."""
     if config.levels == "single":
         return {config.data.get("level"): instantiate(config.data)}
     return {level: instantiate(config.data, level=level) for level in LEVELS}
@@ -94,7 +94,8 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
     folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
     stages = _stages(folder, config, scenes)
     try:
-        models = train_all(stages, scenes, instantiate(config.sharing), instantiate(config.augment))
+        sharing, augment = instantiate(config.sharing), instantiate(config.augment)
+        models = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
     except StoppedError as stop:
         log.warning("%s; the same command goes on from there:\n  %s", stop, _command())
         return STOPPED
@@ -184,6 +185,7 @@ def _report(
         "levels": [level for level in scenes if level is not None]
         if len(scene.mask_vectors)
         else [],
+        "level_models": config.levels,
         "train_seconds": sum(stage.seconds for stage in done),
         "skips": all_skips(done).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,

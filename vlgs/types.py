@@ -60,8 +60,9 @@ class View:
     """File stem; labels and language maps are matched by it, never by position."""
     camera: Camera
     read_image: Callable[[], UInt8[Tensor, "h w 3"]]
-    read_masks: Callable[[], Int[Tensor, "h w"]] | None = None
-    """Language supervision: row of `Scene.mask_vectors` per pixel, -1 where no mask lies (int32)."""
+    read_masks: Callable[[], Int[Tensor, "h w *levels"]] | None = None
+    """Language supervision: row of `Scene.mask_vectors` per pixel, -1 where no mask lies (int32); with `Scene.mask_levels` above 1
+    one per level."""
     read_object_labels: Callable[[], ObjectLabels] | None = None
     read_dense_labels: Callable[[], DenseLabels] | None = None
     read_valid: Callable[[], Bool[Tensor, "h w"]] | None = None
@@ -94,6 +95,8 @@ class Scene:
     """Unit image-text embedding of every mask of every training view at the chosen level; m = 0 without language."""
     mask_areas: Float[Tensor, " m"]
     """Pixels that each row of `mask_vectors` covers over all training views."""
+    mask_levels: int = 1
+    """How many mask levels `View.read_masks` tells apart (``levels=joint``)."""
     classes: tuple[str, ...] = ()
     """What can be asked for: names of dense class ids, or the categories of the object labels."""
     class_kinds: Mapping[str, str] = field(default_factory=dict)
@@ -129,14 +132,14 @@ class Gaussians:
     """Standard deviations along the principal axes, world units, > 0."""
     opacities: Float[Tensor, " n"]
     """Colour opacity o in [0, 1]."""
-    indicators: Float[Tensor, " n"]
-    """Semantic indicator l in [0, 1] (Eq. lancity)."""
+    indicators: Float[Tensor, " n *levels"]
+    """Semantic indicator l in [0, 1] (Eq. lancity); one per mask level with ``indicator=per_level``."""
     sh0: Float[Tensor, "n 3"]
     """Degree-0 spherical harmonics coefficient; RGB = 0.5 + 0.28209479 * sh0."""
     shN: Float[Tensor, "n s 3"]  # noqa: N815 (gsplat's name)
     """Coefficients of degrees 1 to 3; s is 0, 3, 8 or 15."""
     features: Float[Tensor, "n d"]
-    """Language code f."""
+    """Language code f; those of all mask levels side by side with ``levels=joint``."""
     language_shape: Shape | None = None
     """Covariance that language is blended with; None where it is colour's (``sharing=pos``, tab:ab-seperate)."""
 

@@ -52,6 +52,24 @@ def test_growth_has_slopes_within_a_series(tmp_path: Path):
     assert (tmp_path / "growth.pdf").stat().st_size > 0
 
 
+@pytest.mark.slow
+def test_reading_and_protocols_leave_their_stages_and_costs(tmp_path: Path):
+    for name in ("reading", "protocols"):
+        assert main([name, "--quick", "--out", str(tmp_path)]) == 0
+        assert header(tmp_path / f"{name}.csv") >= HEADER
+        table = read_sheet(tmp_path / f"{name}.csv")
+        assert ((table.wall_seconds > 0) & (table.cpu_seconds > 0) & (table.peak_mib > 50)).all()
+    reading, protocols = (read_sheet(tmp_path / f"{n}.csv") for n in ("reading", "protocols"))
+    for _, stages in reading.groupby("language"):
+        assert list(stages.stage)[:4] == [
+            *("imports", "scene read", "Gaussians and codec", "first step")
+        ]
+        for growing in ("wall_seconds", "cpu_seconds", "peak_mib"):
+            assert stages[growing].is_monotonic_increasing
+    assert list(reading.language.unique()) == [False, True]
+    assert set(protocols.protocol) >= {"dense", "lerf_ovs", "lerf_ovs (v2)", "select3d"}
+
+
 def test_every_subcommand_says_what_it_does(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         main(["--help"])

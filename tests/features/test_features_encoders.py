@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tiny_models import save_siglip
 
 from vlgs.features.encoders import DenseMaps, ImageEncoder, square_crop
 from vlgs.features.masks import Mask
@@ -110,6 +111,13 @@ def test_superpixels_tile_the_photograph_and_follow_an_edge():
             colors = image[mask.window][mask.pixels]
             assert len(np.unique(colors)) == 1  # none lies across the edge
         assert (covered == 1).all()
+
+
+def test_siglip_of_many_sizes_is_refused(tmp_path: Path):
+    save_siglip(tmp_path / "model", flexible=True)
+    encoder = ImageEncoder(Pretrained(name="lab/model", weights=str(tmp_path)))
+    with pytest.raises(ValueError, match=r"must take images of one size.*NaFlex"):
+        encoder(noise(), [Mask(0, 0, np.ones((3, 3), bool))], "a")
 
 
 def test_missing_weights_say_what_to_download_and_where(tmp_path: Path):

@@ -11,6 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image
 from rich.console import Console
+from tiny_models import save_siglip
 
 from vlgs import vocabulary
 from vlgs.config import CONF, check_targets, instantiate
@@ -250,8 +251,22 @@ def test_words_get_vectors_in_the_space_of_the_masks(
     with pytest.raises(SystemExit, match="words must be unique, got kettle more than once"):
         vocabulary.main([str(words), str(out), "--model", model])
     words.write_text("kettle")
-    with pytest.raises(SystemExit, match="CLIP weights must be on this machine"):
+    with pytest.raises(SystemExit, match="weights must be on this machine"):
         vocabulary.main([str(words), str(out), "--model", str(tmp_path / "none")])
+
+
+def test_siglip_2_makes_both_words_and_masks(scene: Path, tmp_path: Path):
+    save_siglip(tmp_path / "siglip2-base-patch16-224")
+    extract(config(scene, tmp_path, *QUICK, "features/encoder=siglip2"))
+    maps = scene / "language_features"
+    words = tmp_path / "words.txt"
+    words.write_text("wine glass\nkettle\n", encoding="utf-8")
+    model = str(tmp_path / "siglip2-base-patch16-224")
+    vocabulary.main([str(words), str(maps / "vocabulary.npz"), "--model", model])
+    read = load_scene(root=str(scene))
+    assert read.vocabulary is not None
+    assert read.vocabulary.vectors.shape == (6, 16)
+    assert read.mask_vectors.shape[1] == 16
 
 
 OPTIONS = sorted(

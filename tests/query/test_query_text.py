@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_models import save_clip
+from tiny_models import save_clip, save_siglip
 
 from vlgs.query import LerfRelevancy, TextEncoder, VocabSoftmax, encode_prompts
 from vlgs.query.text import ClipText, VocabularyText
@@ -99,6 +99,34 @@ def test_clip_agrees_with_the_towers_own_parts(clip_folder: Path):
 def test_clip_of_another_width_than_the_scene_is_refused(clip_folder: Path):
     with pytest.raises(ValueError, match=r"as wide as the scene's vocabulary \(8\), got 12"):
         ClipText(table(), str(clip_folder)).encode(["apple"])
+
+
+@pytest.mark.parametrize("flexible", [False, True])
+def test_siglip_pools_the_last_of_a_full_row_of_lower_case(tmp_path: Path, flexible: bool):
+    from transformers import AutoModel, AutoTokenizer
+
+    save_siglip(tmp_path, flexible)
+    encoder = ClipText(model=str(tmp_path))
+    got = encoder.encode(["Apple", "wine glass"])
+    assert got.shape == (2, 16)
+    torch.testing.assert_close(encoder.encode(["apple"])[0], got[0])  # lower case, and no batch
+    assert (got[0] - got[1]).abs().max() > 1e-3
+    ids = AutoTokenizer.from_pretrained(tmp_path)("apple")["input_ids"]
+    row = torch.tensor([ids + [0] * (20 - len(ids))])  # the padding is a token like others
+    tower = AutoModel.from_pretrained(tmp_path).eval().text_model
+    with torch.no_grad():
+        want = tower(input_ids=row).pooler_output
+    torch.testing.assert_close(got[:1], torch.nn.functional.normalize(want, dim=-1))
+
+
+def test_a_model_without_words_is_refused(tmp_path: Path):
+    from transformers import Dinov2Config, Dinov2Model
+
+    save_clip(tmp_path)  # its tokenizer stays
+    small = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 16}
+    Dinov2Model(Dinov2Config.from_dict({**small, "patch_size": 4})).save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=r"must have a text tower .* got a dinov2"):
+        ClipText(model=str(tmp_path)).encode(["apple"])
 
 
 def test_missing_weights_are_explained(tmp_path: Path):

@@ -5,8 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from colmap_scenes import pycolmap, write_scene
 from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 
@@ -81,6 +83,35 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
     assert str(stopped.value).startswith("error: ")
     assert message in str(stopped.value)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_colmap_to_colmap_keeps_tracks(tmp_path: Path):
+    write_scene(tmp_path / "scene", n=4)
+    convert(tmp_path / "scene", tmp_path / "text", "colmap-text")
+    convert(tmp_path / "text", tmp_path / "binary")
+    models = [
+        pycolmap.Reconstruction(str(folder))
+        for folder in (tmp_path / "scene/sparse/0", tmp_path / "text", tmp_path / "binary")
+    ]
+    for model in models:
+        assert [p.track.length() for p in model.points3D.values()] == [4] * 6
+        for number, point in model.points3D.items():
+            assert np.array_equal(point.xyz, models[0].points3D[number].xyz)
+            assert str(point.track) == str(models[0].points3D[number].track)
+        for number, image in model.images.items():
+            assert image.num_points2D() == 6
+            xy = [p.xy for p in image.points2D]
+            assert np.array_equal(xy, [p.xy for p in models[0].images[number].points2D])
+            assert image.cam_from_world() == models[0].images[number].cam_from_world()
+
+
+def test_tracks_of_no_image_are_one_line_and_leave_nothing(tmp_path: Path):
+    write_scene(tmp_path / "scene", n=3, text=True)
+    points = tmp_path / "scene/sparse/0/points3D.txt"
+    points.write_text(points.read_text().rstrip().rsplit(" ", 2)[0] + " 77 0\n")
+    with pytest.raises(ValueError, match=r"tracks and rigs of .* must be those of its images"):
+        convert(tmp_path / "scene", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_as_a_program(tmp_path: Path):

@@ -9,6 +9,7 @@ import torch
 from tiny_runs import TINY, composed
 
 from vlgs.gaussians import read_ply
+from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import fit
 from vlgs.module.lightning import VLGSModule
 from vlgs.run import run
@@ -16,9 +17,16 @@ from vlgs.runs import STOPPED, RunFolder
 
 SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30", "pictures=false", "threads=1")
 SEPARATE = ("sharing=none", "fusion=none")
+LIFTED = ("sharing=lifted", "fusion=none", "indicator=opacity", "blend=none")
 KINDS = {
     "sharing=none": (SEPARATE, {"color", "language"}),
     "levels=separate": (("levels=separate",), {"level_1", "level_2", "level_3"}),
+    "levels=joint": (("levels=joint",), {""}),
+    "joint, an indicator for each level": (
+        ("levels=joint", "indicator=per_level", "augment=offline", "augment.views=2", *SEPARATE),
+        {"augment", "color", "language"},
+    ),
+    "sharing=lifted": ((*LIFTED, "levels=joint"), {"geometry", ""}),
     "augment=offline": (("augment=offline", "augment.views=3"), {"augment", ""}),
     "all of it": (
         ("levels=separate", "augment=offline", "augment.views=2", *SEPARATE),
@@ -43,15 +51,18 @@ def metrics_of(folder: RunFolder) -> dict:
 def test_every_model_has_a_folder_and_the_run_one_result(tmp_path: Path, kind: str):
     overrides, stages = KINDS[kind]
     config = composed(*SHORT, *overrides, f"results={tmp_path}")
-    config.pictures = kind == "sharing=none"
+    config.pictures = kind in ("sharing=none", "levels=joint")
     assert run(config) == 0
     folder = only_run(tmp_path)
     metrics = metrics_of(folder)
     found = {str(path.parent.relative_to(folder.path)) for path in folder.path.rglob("*.ply")}
-    assert {"" if name == "." else name for name in found} == stages - {"augment"}
+    assert {"" if name == "." else name for name in found} == stages - {"augment", "geometry"}
     for name in stages:
-        assert RunFolder(folder.path / name).curves.is_file()
-    assert metrics["levels"] == ([1, 2, 3] if "levels=separate" in overrides else [3])
+        stage = RunFolder(folder.path / name)
+        assert load_checkpoint(stage.checkpoint).step == 30  # type: ignore[union-attr]
+        assert stage.curves.is_file() or (kind == "sharing=lifted" and name == "")
+    assert metrics["levels"] == ([3] if config.levels == "single" else [1, 2, 3])
+    assert metrics["level_models"] == config.levels
     assert metrics["psnr"] > 8
     assert metrics["miou"] is not None
     assert metrics["train_seconds"] > 0
@@ -101,7 +112,10 @@ def test_stopped_anywhere_it_goes_on_to_the_same_bits(
     ("overrides", "message"),
     [
         (["sharing=none"], "fusion must be none with sharing=none.*got vlgs.fusion.*SelfAttention"),
-        (["levels=both"], "levels must be single or separate, got both"),
+        (["levels=both"], "levels must be single, separate or joint, got both"),
+        (["indicator=per_level"], "levels must be joint with indicator=per_level, got single"),
+        (["sharing=lifted"], "fusion must be .*NoFusion with sharing=lifted"),
+        (["sharing=lifted", "fusion=none"], "indicator must be .*ColourOpacity or .*Fixed with"),
         (["augment=offline", "augment.views=0"], "views and neighbours must be at least 1, got 0"),
     ],
 )

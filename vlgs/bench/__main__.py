@@ -154,19 +154,33 @@ def iteration(parser: ArgumentParser) -> Runner:
     return run
 
 
+def reading(parser: ArgumentParser) -> Runner:
+    """From the command to the first training step on many photographs: time and peak memory."""
+    parser.add_argument("--images", type=int, default=300)
+    parser.add_argument("--size", type=int, nargs=2, default=(1152, 868), metavar=("W", "H"))
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.reading import run_reading
+
+        images, size = (6, (64, 48)) if args.quick else (args.images, tuple(args.size))
+        run_reading(images, size, args.out, args.seed)
+        return 0
+
+    return run
+
+
 def protocols(parser: ArgumentParser) -> Runner:
     """Scores of many queries, without rendering."""
     parser.add_argument("--queries", type=int, default=300)
     parser.add_argument("--levels", type=int, default=3, help="mask levels")
-    parser.add_argument("--size", type=int, nargs=2, default=(986, 728), metavar=("W", "H"))
+    parser.add_argument("--size", type=int, nargs=2, default=(1152, 868), metavar=("W", "H"))
+    parser.add_argument("--threads", type=int, default=2)
 
     def run(args: Namespace) -> int:
-        from rich.console import Console
+        from vlgs.bench.protocols import run_protocols
 
-        from vlgs.bench.protocols import measure_protocols, show_protocols
-
-        queries, size = (2, (64, 48)) if args.quick else (args.queries, args.size)
-        Console().print(show_protocols(measure_protocols(queries, args.levels, *size)))
+        queries, size = (2, (64, 48)) if args.quick else (args.queries, tuple(args.size))
+        run_protocols(queries, args.levels, size, args.threads, args.out, args.seed)
         return 0
 
     return run
@@ -226,6 +240,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     train,
     overhead,
     iteration,
+    reading,
     protocols,
     stress,
     fuzz,

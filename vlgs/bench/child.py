@@ -61,6 +61,13 @@ def free_memory() -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
+def peak_mib() -> float:
+    """Most memory that this process has held, in MiB; what `resource` says may be the parent's, from before the fork."""
+    with open("/proc/self/status") as file:
+        sizes = dict(line.split(":", 1) for line in file)
+    return int(sizes["VmHWM"].split()[0]) / 1024
+
+
 @contextmanager
 def _environment(name: str, value: str | None) -> Iterator[None]:
     before = os.environ.get(name)

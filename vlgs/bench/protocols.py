@@ -1,13 +1,13 @@
 """What a protocol costs: the time of its scores over many queries, without rendering."""
 
-import resource
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
-from rich.table import Table
 
+from vlgs.bench.child import Child, peak_mib
+from vlgs.bench.sheet import provenance, show, write_sheet
 from vlgs.metrics.dense import Dense
 from vlgs.metrics.goi import Goi
 from vlgs.metrics.lerf_ovs import LerfOvs
@@ -33,61 +33,75 @@ CLASSES = 15
 
 @dataclass(frozen=True)
 class Cost:
-    """One protocol over all queries."""
+    """One protocol over all queries, in a process of its own."""
 
-    name: str
+    protocol: str
     queries: int
-    cpu_seconds: float
+    width: int
+    height: int
+    levels: int
+    threads: int
     wall_seconds: float
+    cpu_seconds: float
+    peak_mib: float
+    """Most memory of the process, imports and the maps of one view included."""
 
 
-def measure_protocols(
-    queries: int = 300, levels: int = 3, width: int = 986, height: int = 728
+def run_protocols(
+    queries: int, levels: int, size: tuple[int, int], threads: int, out: Path, seed: int
 ) -> list[Cost]:
-    """Score `queries` queries, `CLASSES` in a view, with every protocol on random smooth maps of one size.
+    """Score `queries` queries, `CLASSES` in a view, with every protocol on random smooth maps, and write protocols.csv.
 
     Views are scored again and again from one set of maps; what it costs to make them is not part of the figures.
     """
-    views = -(-queries // CLASSES)
-    seen = _evidence(levels, width, height)
-    return [_measure(protocol, seen, views) for protocol in PROTOCOLS]
-
-
-def show_protocols(costs: Sequence[Cost]) -> Table:
-    """The figures for the terminal."""
-    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    table = Table(
-        "protocol",
-        title=f"{costs[0].queries} queries, {torch.get_num_threads()} threads",
-        caption=f"peak memory of the process, maps included: {peak / 1e6:.0f} MB",
+    header = provenance(seed)
+    costs = []
+    for index in range(len(PROTOCOLS)):
+        with Child() as child:
+            costs.append(child.call(measure, index, queries, levels, size, threads, seed))
+    write_sheet(out / "protocols.csv", costs, header)
+    show(
+        f"{queries} queries, {threads} threads",
+        ("protocol", "CPU s", "wall s", "CPU ms per query", "peak MiB"),
+        [
+            (
+                cost.protocol,
+                f"{cost.cpu_seconds:.1f}",
+                f"{cost.wall_seconds:.1f}",
+                f"{1e3 * cost.cpu_seconds / cost.queries:.0f}",
+                f"{cost.peak_mib:.0f}",
+            )
+            for cost in costs
+        ],
     )
-    for column in ("CPU s", "wall s", "CPU ms per query"):
-        table.add_column(column, justify="right")
-    for cost in costs:
-        table.add_row(
-            cost.name,
-            f"{cost.cpu_seconds:.1f}",
-            f"{cost.wall_seconds:.1f}",
-            f"{1e3 * cost.cpu_seconds / cost.queries:.0f}",
-        )
-    return table
+    return costs
 
 
-def _measure(protocol: EvaluationProtocol, seen: Evidence, views: int) -> Cost:
+def measure(
+    index: int, queries: int, levels: int, size: tuple[int, int], threads: int, seed: int
+) -> Cost:
+    """The figures of one of `PROTOCOLS` in this process."""
+    torch.set_num_threads(threads)
+    protocol, seen = PROTOCOLS[index], _evidence(levels, *size, seed)
     cpu, wall = time.process_time(), time.perf_counter()
-    scores = [score for _ in range(views) for score in protocol.score(seen)]
+    scores = [score for _ in range(-(-queries // CLASSES)) for score in protocol.score(seen)]
     protocol.conclude(scores, seen.classes)
     return Cost(
-        name=f"{protocol.name}{' (v2)' if protocol == LerfOvs(constants=LANGSPLAT_V2) else ''}",
+        protocol=f"{protocol.name}{' (v2)' if protocol == LerfOvs(constants=LANGSPLAT_V2) else ''}",
         queries=len(scores),
-        cpu_seconds=time.process_time() - cpu,
+        width=size[0],
+        height=size[1],
+        levels=levels,
+        threads=threads,
         wall_seconds=time.perf_counter() - wall,
+        cpu_seconds=time.process_time() - cpu,
+        peak_mib=peak_mib(),
     )
 
 
-def _evidence(levels: int, width: int, height: int) -> Evidence:
+def _evidence(levels: int, width: int, height: int, seed: int) -> Evidence:
     """Random maps, smooth as rendered ones are; each class's truth is where it is the largest."""
-    rng = torch.Generator().manual_seed(0)
+    rng = torch.Generator().manual_seed(seed)
     coarse = torch.rand(levels, CLASSES, height // 40 + 1, width // 40 + 1, generator=rng)
     maps = list(
         torch.nn.functional.interpolate(

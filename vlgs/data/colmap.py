@@ -70,7 +70,7 @@ class ColmapSource:
     """Mask level: 0 default, 1 subpart, 2 part, 3 whole."""
     allow_missing_masks: bool = False
     """Whether a training view may lack language maps where others have them."""
-    cache_bytes: int = 1 << 28
+    cache_bytes: int = 1 << 26
     """Decoded pixels that are kept in memory."""
     release: Mapping[str, Any] = field(default_factory=dict)
     """What the paths of a data set's configuration are put together from; `name` says what is looked for."""

@@ -87,6 +87,11 @@ class ImageEncoder:
                     f"{self.pretrained.folder()}: size of preprocessor_config.json must be pixels, got {size}"
                 )
             model = self.pretrained.load(AutoModel).to(self.pretrained.torch_dtype)
+            if model.config.model_type == "siglip2":  # those of one size call themselves siglip
+                raise ValueError(
+                    f"{self.pretrained.folder()}: encoder must take images of one size, as "
+                    "google/siglip2-base-patch16-224 does, got a NaFlex model of SigLIP 2"
+                )
             mean, std = (torch.tensor(settings[k]) for k in ("image_mean", "image_std"))
             self._loaded = model, side, mean, std
         return self._loaded

@@ -160,10 +160,12 @@ def reset_opacity(
 
 def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
     """Gaussians that no image would miss, and those that are not Gaussians at all."""
-    name = "indicator_logits" if config.prune_on == "indicator" else "opacity_logits"
-    weight = params[name].sigmoid()
+    indicator, opacity = params["indicator_logits"].sigmoid(), params["opacity_logits"].sigmoid()
+    if indicator.dim() == 2:  # one level that needs a Gaussian keeps it
+        indicator = indicator.amax(dim=1)
+    weight = indicator if config.prune_on == "indicator" else opacity
     if config.prune_on == "max":
-        weight = weight.maximum(params["indicator_logits"].sigmoid())
+        weight = weight.maximum(indicator)
     # A scale that overflows and a rotation of length zero are as broken as a NaN.
     finite = _largest_scale(params).isfinite()
     for name in ("quats", "language_quats"):

@@ -20,7 +20,8 @@ PARAMETERS = (
     "features",
 )
 """Keys of the raw parameters: means [n, 3], quats [n, 4], log_scales [n, 3], sh0 [n, 3], shN [n, s, 3],
-opacity_logits [n], indicator_logits [n], features [n, d]. Row i of every one of them is Gaussian i."""
+opacity_logits [n], indicator_logits [n] ([n, levels] with ``indicator=per_level``), features [n, d]. Row i of every one of them is
+Gaussian i."""
 
 LANGUAGE_SHAPE = ("language_quats", "language_log_scales")
 """Keys that are there only where language has covariances of its own (``sharing=pos``): [n, 4] and [n, 3]."""
@@ -66,6 +67,19 @@ def with_language_shape(params: Mapping[str, Tensor], own: bool) -> dict[str, Te
         return shared
     started = {f"language_{name}": params[name].clone() for name in ("quats", "log_scales")}
     return shared | {name: params.get(name, started[name]) for name in LANGUAGE_SHAPE}
+
+
+def with_level_indicators(params: Mapping[str, Tensor], levels: int | None) -> dict[str, Tensor]:
+    """The same Gaussians with an indicator for each of so many mask levels, or with one for all.
+
+    One becomes several equal ones; several become one by the mean of their logits, as do those of another number of levels.
+    """
+    logits = params["indicator_logits"]
+    if logits.dim() == 2 and logits.shape[1] != levels:
+        logits = logits.mean(dim=1)
+    if logits.dim() == 1 and levels is not None:
+        logits = logits[:, None].repeat(1, levels)
+    return {**params, "indicator_logits": logits}
 
 
 def complete(params: Mapping[str, Tensor], feature_dim: int) -> dict[str, Tensor]:

@@ -32,8 +32,9 @@ def write_ply(
 ) -> None:
     """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
 
-    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator``, language's own covariances, where there
-    are any, as ``language_scale_0`` ... and ``language_rot_0`` ...; readers that look properties up by name pass over them. The file is complete or the one before stays.
+    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator`` (one per mask level as ``indicator_0`` ...),
+    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ...; readers that look
+    properties up by name pass over them. The file is complete or the one before stays.
 
     Args:
         path: The file; its folder must exist.
@@ -59,7 +60,11 @@ def write_ply(
         stem = "lang" if dialect == "vlgs" else "semantic"
         _append(named, _numbered(stem, columns["features"].shape[1]), columns["features"])
     if dialect == "vlgs":
-        _append(named, ("indicator",), columns["indicator_logits"][:, None])
+        logits = columns["indicator_logits"]
+        if logits.dim() == 1:
+            _append(named, ("indicator",), logits[:, None])
+        else:
+            _append(named, _numbered("indicator", logits.shape[1]), logits)
         if "language_quats" in columns:
             _append(named, _numbered("language_scale", 3), columns["language_log_scales"])
             _append(named, _numbered("language_rot", 4), columns["language_quats"])
@@ -128,6 +133,9 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
     }
     if "indicator" in present:
         params["indicator_logits"] = take("indicator")[:, 0]
+    elif "indicator_0" in present:
+        count = sum(name.startswith("indicator_") for name in present)
+        params["indicator_logits"] = take(*_numbered("indicator", count))
     if n_lang:
         params["features"] = take(*_numbered(stem, n_lang))
     if "language_rot_0" in present:

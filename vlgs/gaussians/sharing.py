@@ -8,14 +8,18 @@ class Sharing:
     """Whether the two modalities share centres and covariances; opacities are `vlgs.indicator`'s matter.
 
     Raises:
-        ValueError: If covariances are shared by Gaussians that are not.
+        ValueError: If covariances are shared by Gaussians that are not, or lifted language should have its own.
     """
 
     means: bool = True
     """Off: two sets of Gaussians, each trained by the losses of its modality alone."""
     covariances: bool = True
     """Off: a second rotation and scale per Gaussian, with which language is blended."""
+    lifted: bool = False
+    """On: language is not trained, but lifted onto what colour alone has learned (systems.md F.4)."""
 
     def __post_init__(self) -> None:
         if self.covariances and not self.means:
             raise ValueError("sharing: covariances must be false where means is false, got true")
+        if self.lifted and not self.covariances:
+            raise ValueError("sharing: covariances must be true where lifted is true, got false")

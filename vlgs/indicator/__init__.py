@@ -14,8 +14,8 @@ from vlgs.types import Gaussians
 class Indicator(Protocol):
     """The whole contract."""
 
-    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
-        """Return the weight in [0, 1] with which each Gaussian's language code is blended."""
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
+        """Return the weight in [0, 1] with which each Gaussian's language code is blended; one per level where they differ."""
         ...
 
 
@@ -24,6 +24,15 @@ class Learned:
     """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. lancity)."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
+        """Return `gaussians.indicators` itself."""
+        return gaussians.indicators
+
+
+@dataclass(frozen=True)
+class PerLevel:
+    """A learned indicator of its own for every mask level (``levels=joint``; systems.md D.8)."""
+
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, "n levels"]:
         """Return `gaussians.indicators` itself."""
         return gaussians.indicators
 

@@ -1,7 +1,10 @@
 """From a scene and the chosen parts to a module that is ready to train."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+
+from torch import Tensor
 
 from vlgs.blend import ViewBlend
 from vlgs.codec import Codec
@@ -9,8 +12,8 @@ from vlgs.codec.autoencoder import Autoencoder
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, initialise
-from vlgs.gaussians.parameters import with_language_shape
-from vlgs.indicator import Indicator
+from vlgs.gaussians.parameters import with_language_shape, with_level_indicators
+from vlgs.indicator import Indicator, PerLevel
 from vlgs.interchange import load_weights, start_from
 from vlgs.losses import Losses
 from vlgs.module.lift import lift_features
@@ -37,8 +40,21 @@ class Parts:
     trainer: TrainerConfig
 
 
-def build_module(scene: Scene, parts: Parts, seed: int, color: bool = True) -> VLGSModule:
-    """Fit the codec, place the Gaussians and put everything together; without `color` for language alone.
+def build_module(
+    scene: Scene,
+    parts: Parts,
+    seed: int,
+    color: bool = True,
+    start: Mapping[str, Tensor] | None = None,
+) -> VLGSModule:
+    """Fit the codec, place the Gaussians and put everything together.
+
+    Args:
+        scene: What is learned.
+        parts: How.
+        seed: Of all draws.
+        color: Off: language alone.
+        start: Raw parameters to start from; None: those of ``gaussians.init``, or the scene's points.
 
     Raises:
         ValueError: If the scene has no training view.
@@ -56,13 +72,18 @@ def build_module(scene: Scene, parts: Parts, seed: int, color: bool = True) -> V
         # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
-    if config.init is None:
-        parameters = initialise(scene, config, codec.dim, seed)
+    width = codec.dim * scene.mask_levels
+    if start is not None:
+        parameters = dict(start)
+    elif config.init is None:
+        parameters = initialise(scene, config, width, seed)
     else:
-        parameters = start_from(config.init, config, codec.dim)
+        parameters = start_from(config.init, config, width)
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.means and not parts.sharing.covariances
     parameters = with_language_shape(parameters, own)
+    several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
+    parameters = with_level_indicators(parameters, scene.mask_levels if several else None)
     evaluated = config.color == "evaluated"
     model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, 0, evaluated)
     module = VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)

@@ -57,6 +57,8 @@ class FrozenRenders:
         opacities = fused.gaussians.opacities
         if opacities.requires_grad or (language and fused.language_weight.requires_grad):
             return None
+        if language and fused.language_weight.dim() == 2:  # as many views as there are indicators
+            return None
         shape = Shape(fused.gaussians.quats, fused.gaussians.scales)
         own = fused.gaussians.language_shape
         by_color = self._view((index, "opacity"), camera, opacities, shape, fused)

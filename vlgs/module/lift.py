@@ -11,21 +11,26 @@ def lift_features(module: VLGSModule) -> None:
     """Start the codes at ``f_i = sum_p w_ip H_p / sum_p w_ip`` over the masked pixels p of all training views, in place.
 
     w_ip is the blending weight of Gaussian i at pixel p. Gaussians that no masked pixel sees keep the code they have. One backward
-    pass per view, as the sums are the gradient of the image by what is blended.
+    pass per view and mask level, as the sums are the gradient of the image by what is blended.
     """
-    features = module.model.splats["features"]
+    features, levels = module.model.splats["features"], module.model.levels
     with torch.no_grad():
         weight = module.model.fuse().language_weight
-    total = features.new_zeros(len(features), features.shape[1] + 1)
+    weights = [weight] * levels if weight.dim() == 1 else [w.contiguous() for w in weight.unbind(1)]
+    total = features.new_zeros(levels, len(features), features.shape[1] // levels + 1)
     for index in range(len(module.scene.train)):
         target = module.target(index)
         if target.codes is None or target.valid is None:
             continue
         seen = target.valid[..., None].to(features)
-        total += _gathered(module, index, weight, torch.cat([target.codes * seen, seen], dim=-1))
+        image = torch.cat([target.codes * seen, seen], dim=-1)
+        for level, own in enumerate(weights):
+            total[level] += _gathered(module, index, own, image[:, level::levels].contiguous())
     with torch.no_grad():
-        lifted = total[:, :-1] / total[:, -1:].clamp_min(torch.finfo(total.dtype).tiny)
-        features.copy_(torch.where(total[:, -1:] > 0, lifted, features))
+        codes = features.unflatten(1, (levels, -1)).transpose(0, 1)
+        lifted = total[..., :-1] / total[..., -1:].clamp_min(torch.finfo(total.dtype).tiny)
+        lifted = torch.where(total[..., -1:] > 0, lifted, codes)
+        features.copy_(lifted.transpose(0, 1).flatten(1))
 
 
 def _gathered(

@@ -23,8 +23,8 @@ from vlgs.module.skips import SkipCount
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
-TARGET_BYTES = 512 << 20
-"""Images and code maps kept as float32 for the losses: all views of a small scene, the latest ones of a large one."""
+TARGET_BYTES = 256 << 20
+"""Most memory for images and code maps kept as float32 for the losses: those of all views or, where they take more, of one iteration."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,11 @@ class Target:
 
     view: View
     image: Float[Tensor, "h w 3"]
-    codes: Float[Tensor, "h w d"] | None
-    valid: Bool[Tensor, "h w"] | None
-    """Pixels with a mask; None like `codes` where the view has no language."""
+    codes: Float[Tensor, "h wl d"] | None
+    """Language codes; with ``levels=joint`` those of the l mask levels of a pixel stand beside each other in its row, so that losses
+    and blending need not know of levels."""
+    valid: Bool[Tensor, "h wl"] | None
+    """Where there is a mask; None like `codes` where the view has no language."""
 
 
 @dataclass
@@ -101,7 +103,7 @@ class VLGSModule(L.LightningModule):
         self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
-        self.target_cache = PixelCache(TARGET_BYTES)
+        self.target_cache = PixelCache(self._room_for_targets())
         freeze(model, tuple(trainer_config.freeze), gaussians_config.densify.stop)
         self.optimizer = self._make_optimizer()
         self.densify_state = DensifyState.zeros(model.count)
@@ -169,9 +171,10 @@ class VLGSModule(L.LightningModule):
         if view.read_masks is None or not self.has_language:
             return Target(view, image, None, None)
         read = view.read_masks
-        # Row -1, "no mask", takes the zero code that stands last.
-        codes = kept.get((index, "codes"), lambda: self.mask_codes[read().long()])
-        return Target(view, image, codes, kept.get((index, "valid"), lambda: read() >= 0))
+        # Row -1, "no mask", takes the zero code that stands last. A pixel of several mask levels becomes as many pixels of a row.
+        codes = kept.get((index, "codes"), lambda: self.mask_codes[read().long()].flatten(1, -2))
+        valid = kept.get((index, "valid"), lambda: (read() >= 0).flatten(1))
+        return Target(view, image, codes, valid)
 
     def similarity(self, first: int, second: int) -> float:
         """SSIM(I1, I2), clamped at 0, computed once per pair."""
@@ -191,6 +194,13 @@ class VLGSModule(L.LightningModule):
         with torch.no_grad():
             codes = self.model.codec.encode(self.scene.mask_vectors)
         return torch.cat([codes, torch.zeros(1, codes.shape[1])])
+
+    def _room_for_targets(self) -> int:
+        """Bytes; a part of the views would be found again too seldom to be worth its memory."""
+        code = 4 * self.mask_codes.shape[1] + 1  # and whether it counts
+        pixel = 3 * 4 + (code * self.scene.mask_levels if self.has_language else 0)
+        views = [pixel * view.camera.width * view.camera.height for view in self.scene.train]
+        return sum(views) if sum(views) <= TARGET_BYTES else 2 * max(views)
 
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = self.settings.learning_rates
@@ -246,7 +256,8 @@ class VLGSModule(L.LightningModule):
     def _language_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.feature is None or target.codes is None:
             return torch.zeros(())
-        return self.losses.language_loss(render.feature, target.codes, target.valid)
+        feature = render.feature.view_as(target.codes)
+        return self.losses.language_loss(feature, target.codes, target.valid)
 
     def _backward(
         self, total: Tensor, color_losses: list[Tensor], renders: list[ViewRender]
@@ -307,7 +318,7 @@ class VLGSModule(L.LightningModule):
             with self.skips.doing("blended render"):
                 feature = self.model.render(plan.camera, color=False, fused=fused).feature
         assert feature is not None
-        return self.losses.blended_loss(feature, codes, valid, plan.similarity)
+        return self.losses.blended_loss(feature.view_as(codes), codes, valid, plan.similarity)
 
     def _color_mse(self, renders: list[ViewRender], targets: tuple[Target, ...]) -> float:
         with torch.no_grad():

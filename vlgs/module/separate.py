@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians.parameters import PARAMETERS
-from vlgs.indicator import Fixed, Learned
+from vlgs.indicator import Fixed, Learned, PerLevel
 from vlgs.module.build import Parts
 from vlgs.render.model import SplatModel
 from vlgs.types import Scene
@@ -23,6 +23,7 @@ def without_language(scene: Scene) -> Scene:
         train=tuple(replace(view, read_masks=None) for view in scene.train),
         mask_vectors=scene.mask_vectors[:0],
         mask_areas=scene.mask_areas[:0],
+        mask_levels=1,
     )
 
 
@@ -40,7 +41,8 @@ def for_language(parts: Parts) -> Parts:
         densify_on="total",
         densify=replace(config.densify, reset_indicator=True),
     )
-    indicator = parts.indicator if isinstance(parts.indicator, Fixed) else Learned()
+    own = isinstance(parts.indicator, (Fixed, PerLevel))
+    indicator = parts.indicator if own else Learned()
     return replace(parts, gaussians=config, indicator=indicator)
 
 
@@ -56,11 +58,13 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
     n, m = color.count, language.count
     theirs["shN"] = ours["shN"].new_zeros(m, *ours["shN"].shape[1:])
     theirs["opacity_logits"] = torch.full((m,), NOWHERE)
-    ours["indicator_logits"] = torch.full((n,), NOWHERE)
+    levels = theirs["indicator_logits"].shape[1:]
+    ours["indicator_logits"] = torch.full((n, *levels), NOWHERE)
     ours["features"] = torch.zeros(n, theirs["features"].shape[1])
     if isinstance(language.indicator, Fixed):
         theirs["indicator_logits"] = torch.full((m,), language.indicator.value).logit()
     both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in PARAMETERS}
-    model = SplatModel(both, NoFusion(), Learned(), language.codec, color.raster, color.sh_degree)
+    indicator = language.indicator if isinstance(language.indicator, PerLevel) else Learned()
+    model = SplatModel(both, NoFusion(), indicator, language.codec, color.raster, color.sh_degree)
     model.splats = nn.ParameterDict({k: nn.Parameter(v, False) for k, v in both.items()})
     return model

@@ -5,15 +5,23 @@ own; a stage that is done is read back from its checkpoint, so that the same com
 """
 
 import logging
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+
+import torch
 
 from vlgs.gaussians import Sharing
 from vlgs.module.augment import NoAugment, Offline
 from vlgs.module.build import Parts, build_module
+from vlgs.module.checkpoint import save_checkpoint
 from vlgs.module.fit import FitOptions, fit
+from vlgs.module.joint import join_levels
+from vlgs.module.lift import lift_features
 from vlgs.module.separate import for_language, unite, without_language
 from vlgs.module.skips import SkipCount
+from vlgs.module.state import capture
+from vlgs.render.level import LevelModel, by_level
 from vlgs.render.model import SplatModel
 from vlgs.runs import RunFolder
 from vlgs.types import Scene
@@ -22,6 +30,8 @@ log = logging.getLogger(__name__)
 
 AUGMENT = "augment"
 """Name of the model that renders further training views."""
+GEOMETRY = "geometry"
+"""Name of the model of colour that language is lifted onto."""
 
 
 class StoppedError(Exception):
@@ -62,8 +72,8 @@ class Stages:
 
     @property
     def kept(self) -> list[Stage]:
-        """What the result is made of: all but the model that only rendered further views."""
-        return [stage for name, stage in self.done.items() if name != AUGMENT]
+        """What the result is made of: all but the models that others were made from."""
+        return [stage for name, stage in self.done.items() if name not in (AUGMENT, GEOMETRY)]
 
     def train(self, name: str, scene: Scene, color: bool = True) -> SplatModel:
         """Train a model, or read it back.
@@ -89,21 +99,44 @@ class Stages:
         self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips)
         return module.model
 
+    def lift(self, name: str, geometry: SplatModel, scene: Scene) -> SplatModel:
+        """Lift the language of a scene onto finished Gaussians (`lift_features`); the folder is as that of a trained model.
+
+        Args:
+            name: Sub-folder; empty for the folder of the run itself.
+            geometry: Trained on colour.
+            scene: Whose masks count.
+        """
+        folder, started = RunFolder(self.folder.path / name), time.perf_counter()
+        parts = self.make_parts()
+        start = {key: value.detach() for key, value in geometry.splats.items()}
+        start["features"] = torch.zeros(geometry.count, parts.codec.dim * scene.mask_levels)
+        module = build_module(scene, parts, self.seed, start=start)
+        module.model.sh_degree = geometry.sh_degree
+        lift_features(module)
+        module.next_step = module.settings.iterations
+        module.train_seconds = time.perf_counter() - started
+        save_checkpoint(folder.checkpoint, capture(module, self.make_options().meta))
+        self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips)
+        return module.model
+
 
 def train_all(
     stages: Stages,
     scenes: Mapping[int | None, Scene],
     sharing: Sharing,
     augment: Offline | NoAugment,
-) -> list[SplatModel]:
+    joint: bool = False,
+) -> list[SplatModel | LevelModel]:
     """Train everything that a run is made of.
 
     Args:
         stages: Where and with what.
-        scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate``.
-        sharing: Whether colour and language are one model.
+        scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate`` and ``joint``.
+        sharing: Whether colour and language are one model, and whether language is trained at all.
         augment: Further training views, rendered from a first model of colour alone (systems.md D.17); what `Offline.require`
             asks for is there.
+        joint: Whether one model learns all levels.
 
     Returns:
         One model per level, in their order; one alone if there is no language.
@@ -117,9 +150,15 @@ def train_all(
         first = stages.train(AUGMENT, without_language(next(iter(scenes.values()))))
         maps = stages.folder.path / AUGMENT / "language"
         scenes = augment.extend(scenes, first, stages.seed, maps)
+    if joint:
+        scenes = {None: join_levels(list(scenes.values()))}
     models, color = [], None
     for level, scene in scenes.items():
         name = f"level_{level}" if len(scenes) > 1 else ""
+        if sharing.lifted and len(scene.mask_vectors):
+            color = color or stages.train(GEOMETRY, without_language(scene))
+            models.append(stages.lift(name, color, scene))
+            continue
         if sharing.means:
             models.append(stages.train(name, scene))
             continue
@@ -129,7 +168,7 @@ def train_all(
         else:
             language = stages.train("/".join(filter(None, [name, "language"])), scene, color=False)
             models.append(unite(color, language))
-    return models
+    return [at_level for model in models for at_level in by_level(model)]
 
 
 def all_skips(stages: Iterable[Stage]) -> SkipCount:

@@ -22,21 +22,22 @@ LOOKS = 3
 
 
 def stuck_share(
-    gradient: Float[Tensor, " n"],
+    gradient: Float[Tensor, " n *levels"],
     means2d: Sequence[Float[Tensor, "n 2"]],
     cameras: Sequence[Camera],
 ) -> float:
-    """Share of exactly zero gradients among the Gaussians whose centre lies in at least one view; 0 if there are none.
+    """Share of exactly zero gradients, at all levels, among the Gaussians whose centre lies in a view; 0 if there are none.
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.eye(3), 10, 10)
         >>> stuck_share(torch.tensor([0.0, 1.0, 0.0]), [torch.tensor([[5.0, 5.0], [1.0, 2.0], [50.0, 5.0]])], [camera])
         0.5
     """
-    seen = torch.zeros_like(gradient, dtype=torch.bool)
+    still = (gradient == 0).reshape(len(gradient), -1).all(dim=1)
+    seen = torch.zeros_like(still)
     for mean2d, camera in zip(means2d, cameras, strict=True):
         seen |= _inside(mean2d.detach(), camera)
-    return float(((gradient == 0) & seen).sum() / seen.sum().clamp_min(1))
+    return float((still & seen).sum() / seen.sum().clamp_min(1))
 
 
 def _inside(mean2d: Float[Tensor, "n 2"], camera: Camera) -> Bool[Tensor, " n"]:

@@ -1,4 +1,4 @@
-"""From words to text embeddings: a table of known words, or CLIP's text tower."""
+"""From words to text embeddings: a table of known words, or the text tower of CLIP or SigLIP."""
 
 import difflib
 from collections.abc import Sequence
@@ -67,9 +67,11 @@ class VocabularyText:
 
 
 class ClipText:
-    """CLIP's text tower through transformers, from local files only: raw words, no template (systems.md B.0).
+    """A text tower through transformers, from local files only: raw words, no template (systems.md B.0).
 
-    Nothing is loaded before the first word is encoded.
+    CLIP's, or that of SigLIP and SigLIP 2. Those were trained on lower case, always padded to their full length on the right and
+    without a mask, and look at the last position alone, so that words come to them in just this way. Nothing is loaded before the
+    first word is encoded.
 
     Args:
         model: Name in the local Hugging Face cache, or a folder with config, tokenizer and weights.
@@ -78,7 +80,7 @@ class ClipText:
 
     Raises:
         FileNotFoundError: On first use, if the weights are not on this machine.
-        ValueError: On first use, if the width differs from the vocabulary's.
+        ValueError: On first use, if the model has no text tower, or its width differs from the vocabulary's.
     """
 
     def __init__(self, vocabulary: Vocabulary | None = None, model: str = CLIP_MODEL) -> None:
@@ -89,9 +91,8 @@ class ClipText:
     def encode(self, names: Sequence[str]) -> Float[Tensor, "k e"]:
         """Unit text embeddings of any words."""
         tokenizer, model = self._load()
-        tokens = tokenizer(list(names), padding=True, truncation=True, return_tensors="pt")
         with torch.no_grad():
-            out = model.get_text_features(**tokens)
+            out = model.get_text_features(**_tokens(tokenizer, model, names))
         vectors = (
             out if isinstance(out, Tensor) else out.pooler_output
         )  # the latter since transformers 5
@@ -104,16 +105,35 @@ class ClipText:
 
     def _load(self) -> tuple[Any, Any]:
         if self._loaded is None:
-            from transformers import AutoTokenizer, CLIPModel  # 2.6 s, and an optional dependency
+            from transformers import AutoModel, AutoTokenizer  # 2.6 s, and an optional dependency
 
             try:
                 tokenizer = AutoTokenizer.from_pretrained(self.model, local_files_only=True)
-                model = CLIPModel.from_pretrained(self.model, local_files_only=True)
+                model = AutoModel.from_pretrained(self.model, local_files_only=True)
             except OSError as error:
                 raise FileNotFoundError(
-                    f"text: CLIP weights must be on this machine, got none for {self.model!r}; run "
+                    f"text: weights must be on this machine, got none for {self.model!r}; run "
                     f"`hf download {self.model}` where there is a network and copy ~/.cache/huggingface, or set "
                     "text.model=<folder with config.json, tokenizer.json and model.safetensors>, or text=vocabulary"
                 ) from error
+            if not hasattr(model, "get_text_features"):
+                raise ValueError(
+                    f"text: {self.model} must have a text tower as CLIP and SigLIP do, got a {model.config.model_type}"
+                )
             self._loaded = tokenizer, model.eval()
         return self._loaded
+
+
+def _tokens(tokenizer: Any, model: Any, names: Sequence[str]) -> dict[str, Tensor]:
+    """What a text tower takes, padded as it was trained."""
+    if not model.config.model_type.startswith("siglip"):
+        return dict(tokenizer(list(names), padding=True, truncation=True, return_tensors="pt"))
+    tokenizer.padding_side = "right"
+    tokens = tokenizer(
+        [name.lower() for name in names],
+        padding="max_length",
+        max_length=model.config.text_config.max_position_embeddings,
+        truncation=True,
+        return_tensors="pt",
+    )
+    return {"input_ids": tokens["input_ids"]}

@@ -26,11 +26,13 @@ class FusedGaussians:
     color: Float[Tensor, "n 3"]
     """u_1..3 of Eq. attention: RGB before the view-dependent part is added."""
     feature: Float[Tensor, "n d"]
-    """u_4.. of Eq. attention."""
-    language_weight: Float[Tensor, " n"]
+    """u_4.. of Eq. attention; the codes of all mask levels side by side with ``levels=joint``."""
+    language_weight: Float[Tensor, " n *levels"]
     """What blends language: l, o or a constant, as the indicator says (Eq. lancity)."""
     rows: int
     """How many were fused; all, unless they were fused for some cameras alone."""
+    level: int | None = None
+    """Place of the mask level that `feature` and `language_weight` are of; None: all that the model has."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class ViewRender:
     color: Float[Tensor, "h w 3"] | None
     feature: Float[Tensor, "h w d"] | None
     alpha_color: Float[Tensor, "h w"] | None
-    alpha_language: Float[Tensor, "h w"] | None
+    alpha_language: Float[Tensor, "h w *levels"] | None
     visible: Bool[Tensor, " n"]
     mean2d: Float[Tensor, "n 2"]
 
@@ -82,6 +84,11 @@ class SplatModel(nn.Module):
     def count(self) -> int:
         """Number of Gaussians."""
         return self.splats["means"].shape[0]
+
+    @property
+    def levels(self) -> int:
+        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``."""
+        return self.splats["features"].shape[1] // self.codec.dim
 
     def gaussians(self) -> Gaussians:
         """The Gaussians in natural units."""
@@ -133,18 +140,24 @@ class SplatModel(nn.Module):
         groups, values, feature = [], None, fused.feature
         if self.evaluated:
             values, feature = self._fuse_as_seen(fused.gaussians, camera)
+            if fused.level is not None:
+                feature = feature.chunk(self.levels, dim=1)[fused.level]
         if color:
             values = self.view_color(fused, camera) if values is None else values
             groups.append(ChannelGroup(values, fused.gaussians.opacities))
         if language:
-            shape = fused.gaussians.language_shape
-            groups.append(ChannelGroup(feature, fused.language_weight, shape=shape))
+            groups += _language_groups(feature, fused)
         out = self._rasterize(fused.gaussians, groups, camera)
+        seen, alpha = out.images[-1], out.alphas[-1]
+        if language and fused.language_weight.dim() == 2:
+            levels = fused.language_weight.shape[1]
+            seen = torch.cat(out.images[-levels:], dim=-1)
+            alpha = torch.stack(out.alphas[-levels:], dim=-1)
         return ViewRender(
             color=out.images[0] if color else None,
-            feature=out.images[-1] if language else None,
+            feature=seen if language else None,
             alpha_color=out.alphas[0] if color else None,
-            alpha_language=out.alphas[-1] if language else None,
+            alpha_language=alpha if language else None,
             visible=out.visible,
             mean2d=out.mean2d,
         )
@@ -184,3 +197,12 @@ class SplatModel(nn.Module):
             camera.height,
             config=self.raster,
         )
+
+
+def _language_groups(feature: Float[Tensor, "n d"], fused: FusedGaussians) -> list[ChannelGroup]:
+    """All codes in one group, or a group per mask level where each has an indicator of its own."""
+    weight, shape = fused.language_weight, fused.gaussians.language_shape
+    if weight.dim() == 1:
+        return [ChannelGroup(feature, weight, shape=shape)]
+    levels = zip(feature.chunk(weight.shape[1], dim=1), weight.unbind(dim=1), strict=True)
+    return [ChannelGroup(codes, own.contiguous(), shape=shape) for codes, own in levels]

@@ -65,7 +65,7 @@ def evaluate(
     carries the text vector of its true class.
 
     Args:
-        model: The trained scene, or one per mask level, finest first (``levels=separate``); colour is then that of the first.
+        model: The trained scene, or one per mask level, finest first (``levels=separate``, ``joint``); colour is then that of the first.
         scene: Its held-out views, labels and classes.
         query: Relevancy of a prompt.
         text: Encodes `Scene.classes`. Without it, or if it lacks a word, there are no language scores, and the reason is given.

@@ -48,7 +48,11 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "n_gaussians": ("", "Gaussians at the end, of all models of the run together"),
     "levels": (
         "",
-        "mask level of each model: one of data.level, or 1, 2, 3 with levels=separate; empty without language",
+        "mask levels that were learned: data.level, or 1, 2, 3 with levels=separate or joint; empty without language",
+    ),
+    "level_models": (
+        "",
+        "single: one model of one level; separate: a model for each; joint: one model with codes of all",
     ),
     "train_seconds": (
         "s",

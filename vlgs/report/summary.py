@@ -64,7 +64,8 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
     told = [f"protocol: {metrics['protocol']}"]
     if metrics.get("levels"):
-        told.append(f"mask levels: {', '.join(map(str, metrics['levels']))}")
+        several = f" ({metrics['level_models']})" if len(metrics["levels"]) > 1 else ""
+        told.append(f"mask levels: {', '.join(map(str, metrics['levels']))}{several}")
     return Group(table, *notes, *map(Text, told), *places)
 
 

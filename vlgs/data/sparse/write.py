@@ -2,6 +2,7 @@
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,14 +11,42 @@ from vlgs.data.sparse.model import SparseModel
 
 
 def write_colmap(folder: Path, model: SparseModel, text: bool = False) -> None:
-    """Write cameras, images and points to a new folder: all of it, or nothing. Tracks are not part of a `SparseModel`.
+    """Write cameras, images and points to a new folder: all of it, or nothing.
+
+    A reconstruction that is COLMAP's own keeps what a `SparseModel` has no place for: rigs, 2D points, and the tracks that tie
+    them to the sparse points.
+
+    Args:
+        folder: To be made.
+        model: As from `vlgs.data.sparse.read_cameras`, so that its files have been read to the last byte.
+        text: ``.txt`` in place of ``.bin``.
 
     Raises:
-        ValueError: If the folder is not new or empty.
+        ValueError: If the folder is not new or empty, or COLMAP refuses the tracks or rigs of its files.
         OSError: If it cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"colmap: OUT must be a new or empty folder, got {folder}")
+    whole = _reread(model) if model.suffix in (".bin", ".txt") else _rebuild(model)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
+        out = Path(scratch) / "model"
+        out.mkdir()
+        whole.write_text(str(out)) if text else whole.write(str(out))
+        out.replace(folder)
+
+
+def _reread(model: SparseModel) -> Any:
+    try:
+        return import_pycolmap().Reconstruction(str(model.folder))
+    except (ValueError, IndexError, RuntimeError) as error:  # what its C++ throws
+        raise ValueError(
+            f"colmap: tracks and rigs of {model.folder} must be those of its images, got: {error}"
+        ) from error
+
+
+def _rebuild(model: SparseModel) -> Any:
+    """A reconstruction of cameras, poses and points alone."""
     pycolmap = import_pycolmap()
     out = pycolmap.Reconstruction()
     for camera in model.cameras:
@@ -38,9 +67,4 @@ def write_colmap(folder: Path, model: SparseModel, text: bool = False) -> None:
         out.add_image_with_trivial_frame(entry, pose)
     for point, color in zip(model.points, model.point_colors, strict=True):
         out.add_point3D(point, pycolmap.Track(), color)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
-        whole = Path(scratch) / "model"
-        whole.mkdir()
-        out.write_text(str(whole)) if text else out.write(str(whole))
-        whole.replace(folder)
+    return out

@@ -1,0 +1,171 @@
+"""From the command to the first training step on many large photographs: time and peak memory, stage by stage."""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vlgs.bench.child import Child, peak_mib
+
+if TYPE_CHECKING:
+    from vlgs.module.lightning import VLGSModule
+
+DISTINCT = 10
+"""Photographs and language maps that differ; the others are further names of them, and are read and hashed like any other."""
+MASKS = (30, 120, 80, 40)
+"""Masks of a photograph at the four levels."""
+POINTS = 50_000
+STEPS = 3
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Where a process has come to, since it was started."""
+
+    language: bool
+    images: int
+    width: int
+    height: int
+    stage: str
+    wall_seconds: float
+    cpu_seconds: float
+    peak_mib: float
+    """Most memory that the process has held so far."""
+
+
+def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> list[Reached]:
+    """Write scenes to a scratch folder, train on them for a moment in processes of their own, and write reading.csv."""
+    from vlgs.bench.sheet import provenance, show, write_sheet
+
+    notes = f"files are in the page cache; photographs and language maps repeat after {DISTINCT}"
+    header = provenance(seed, note=notes)
+    rows: list[Reached] = []
+    with tempfile.TemporaryDirectory(prefix="vlgs-reading-") as scratch:
+        for language in (False, True):
+            root = Path(scratch) / f"language_{language}"
+            write_photographs(root, images, size, language, seed)
+            started = time.time()
+            with Child() as child:
+                for stage, *reached in child.call(stages, root, started):
+                    rows.append(Reached(language, images, *size, stage, *reached))
+    write_sheet(out / "reading.csv", rows, header)
+    show(
+        f"{images} photographs of {size[0]} x {size[1]}",
+        ("language, stage", "wall s", "CPU s", "peak MiB"),
+        [
+            (
+                f"{'with' if row.language else 'without'}, {row.stage}",
+                f"{row.wall_seconds:.1f}",
+                f"{row.cpu_seconds:.1f}",
+                f"{row.peak_mib:.0f}",
+            )
+            for row in rows
+        ],
+    )
+    return rows
+
+
+def stages(root: Path, started: float) -> list[tuple[str, float, float, float]]:
+    """What `python -m vlgs.run data=colmap data.root=ROOT trainer=photos` does up to its first steps.
+
+    Args:
+        root: Scene.
+        started: `time.time()` at the start of this process.
+
+    Returns:
+        Stage, and from its wall seconds on the columns of `Reached`.
+    """
+    from vlgs.bench.presets import build, composed
+    from vlgs.config import instantiate
+
+    rows: list[tuple[str, float, float, float]] = []
+
+    def reach(stage: str) -> None:
+        rows.append((stage, time.time() - started, time.process_time(), peak_mib()))
+
+    options = ["data=colmap", f"data.root={root}", "trainer=photos", "codec.cache_dir=null"]
+    config = composed(options)
+    reach("imports")
+    scene = instantiate(config.data)
+    reach("scene read")
+    module = build(config, scene)
+    reach("Gaussians and codec")
+    for stage, work in _training(module):
+        work()
+        reach(stage)
+    return rows
+
+
+def _training(module: "VLGSModule") -> Iterator[tuple[str, Callable[[], object]]]:
+    def decode() -> None:
+        for index in range(len(module.scene.train)):
+            module.target(index)
+
+    yield "first step", lambda: module.training_step(0, 0)
+    yield "every view decoded once", decode
+    yield f"{STEPS} more steps", lambda: [module.training_step(i, 0) for i in range(1, STEPS + 1)]
+
+
+def write_photographs(
+    root: Path, images: int, size: tuple[int, int], language: bool, seed: int
+) -> None:
+    """A COLMAP scene of smooth noise: cameras on a circle, points in the middle, four levels of masks."""
+    from PIL import Image
+
+    from vlgs.data.sparse import SparseCamera, SparseImage, SparseModel
+    from vlgs.data.sparse.write import write_colmap
+
+    (root / "images").mkdir(parents=True)
+    rng, (width, height) = np.random.default_rng(seed), size
+    names = [f"frame_{i + 1:05d}" for i in range(images)]
+    for i, name in enumerate(names):
+        path = root / "images" / f"{name}.jpg"
+        if i >= DISTINCT:
+            os.link(root / "images" / f"{names[i % DISTINCT]}.jpg", path)
+            continue
+        coarse = Image.fromarray(rng.integers(0, 256, (height // 8, width // 8, 3), np.uint8))
+        coarse.resize(size, Image.Resampling.BICUBIC).save(path, quality=92)
+    angles = 2 * np.pi * np.arange(images) / images
+    views = [
+        SparseImage(
+            i + 1, 1, f"{name}.jpg", (np.cos(a / 2), 0.0, np.sin(a / 2), 0.0), (0.0, 0.0, 4.0), -1
+        )
+        for i, (name, a) in enumerate(zip(names, angles, strict=True))
+    ]
+    camera = SparseCamera(1, "PINHOLE", width, height, (width, width, width / 2, height / 2))
+    ids, points = np.arange(POINTS) + 1, rng.normal(size=(POINTS, 3))
+    colors = rng.integers(0, 256, (POINTS, 3)).astype(np.uint8)
+    model = SparseModel(root, "noise", (camera,), tuple(views), ids, points, colors)
+    write_colmap(root / "sparse" / "0", model)
+    if language:
+        _write_masks(root / "language_features", names, size, rng)
+
+
+def _write_masks(
+    folder: Path, names: list[str], size: tuple[int, int], rng: np.random.Generator
+) -> None:
+    from PIL import Image
+
+    from vlgs.data.language import write_mask_files
+
+    folder.mkdir()
+    for i, name in enumerate(names):
+        if i >= DISTINCT:
+            for kind in "sf":
+                other = names[i % DISTINCT]
+                os.link(folder / f"{other}_{kind}.npy", folder / f"{name}_{kind}.npy")
+            continue
+        levels, first = [], 0
+        for count in MASKS:
+            cells = rng.integers(-1, count, (12, 16)).astype(np.int32)
+            ids = np.asarray(Image.fromarray(cells).resize(size, Image.Resampling.NEAREST))
+            levels.append(np.where(ids >= 0, ids + first, -1))
+            first += count
+        vectors = rng.normal(size=(first, 512))
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        write_mask_files(folder, name, np.stack(levels), vectors)
