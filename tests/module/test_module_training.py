@@ -156,6 +156,13 @@ def test_a_non_finite_gradient_names_its_row(tiny_scene: Scene, tmp_path: Path, 
         train(module, tmp_path)
 
 
+def test_a_large_gradient_is_no_fault(tiny_scene: Scene, tmp_path: Path):
+    """Its square is infinite in float32, it is not."""
+    module = module_of(tiny_scene, "trainer.iterations=1")
+    module.model.splats["features"].register_hook(lambda gradient: gradient.clamp_min(1e30))
+    assert train(module, tmp_path).next_step == 1
+
+
 def test_a_view_that_sees_nothing_trains_on(tiny_scene: Scene, tmp_path: Path):
     away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # looks the other way
     blind = tuple(
