@@ -3,6 +3,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -12,6 +13,7 @@
 #include "attention.h"
 #include "frozen.h"
 #include "rasterizer.h"
+#include "squared_error.h"
 #include "view_color.h"
 #include "window.h"
 
@@ -254,6 +256,44 @@ void bind_filter(nb::module_ &m) {
         filter<T>(window, threads);
       },
       strict("planes"), strict("taps"), strict("out"), "threads"_a);
+  m.def(
+      "similarity",
+      [](Image<const T> a, Image<const T> b, Array<const T, kTaps> taps, double luminance_floor,
+         double structure_floor, Image<T> out, int threads) {
+        const Similarity<T> s{
+            int64_t(a.shape(0)), int64_t(a.shape(1)), int64_t(a.shape(2)), a.data(),  b.data(),
+            taps.data(),         T(luminance_floor),  T(structure_floor),  out.data()};
+        nb::gil_scoped_release unlocked;
+        similarity<T>(s, threads);
+      },
+      strict("a"), strict("b"), strict("taps"), "luminance_floor"_a, "structure_floor"_a, strict("out"),
+      "threads"_a);
+}
+
+template <class T>
+void bind_squared_error(nb::module_ &m) {
+  using Valid = std::optional<Array<const bool, -1, -1>>;
+  const auto make = [](const Image<const T> &a, const Image<const T> &b, const Valid &valid) {
+    return SquaredError<T>{int64_t(a.shape(0) * a.shape(1)), int64_t(a.shape(2)), a.data(), b.data(),
+                           valid ? valid->data() : nullptr};
+  };
+  m.def(
+      "squared_error",
+      [make](Image<const T> a, Image<const T> b, Valid valid, int threads) {
+        const auto e = make(a, b, valid);
+        nb::gil_scoped_release unlocked;
+        const ErrorSum total = squared_error<T>(e, threads);
+        return std::pair(total.sum, total.pixels);
+      },
+      strict("a"), strict("b"), strict("valid").none(), "threads"_a);
+  m.def(
+      "squared_error_backward",
+      [make](Image<const T> a, Image<const T> b, Valid valid, double scale, Image<T> d_a, int threads) {
+        const auto e = make(a, b, valid);
+        nb::gil_scoped_release unlocked;
+        squared_error_backward<T>(e, T(scale), d_a.data(), threads);
+      },
+      strict("a"), strict("b"), strict("valid").none(), "scale"_a, strict("d_a"), "threads"_a);
 }
 
 template <class T>
@@ -338,6 +378,8 @@ NB_MODULE(_csrc, m) {
   bind_view_color<double>(m);
   bind_filter<float>(m);
   bind_filter<double>(m);
+  bind_squared_error<float>(m);
+  bind_squared_error<double>(m);
   bind_frozen<float>(m, "FrozenFloat");
   bind_frozen<double>(m, "FrozenDouble");
 }

@@ -19,7 +19,12 @@ const Kernels<float> kFloat = {project,
                                attention,
                                attention_backward,
                                multiply_add,
-                               filter_plane};
+                               window_scratch,
+                               filter_plane,
+                               similarity_scratch,
+                               similarity_plane,
+                               squared_error_chunk,
+                               squared_error_chunk_backward};
 const Kernels<double> kDouble = {project,
                                  project_backward,
                                  boxes,
@@ -36,6 +41,11 @@ const Kernels<double> kDouble = {project,
                                  attention,
                                  attention_backward,
                                  multiply_add,
-                                 filter_plane};
+                                 window_scratch,
+                                 filter_plane,
+                                 similarity_scratch,
+                                 similarity_plane,
+                                 squared_error_chunk,
+                                 squared_error_chunk_backward};
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -34,8 +34,16 @@ void attention_backward(const Attention<T> &, Fused<const T *> d_out, Fused<T *>
                         int64_t end, T *scratch, AttentionLayers<T *> sums);
 template <class T>
 T multiply_add(int64_t rounds, T factor, T addend);
+int64_t window_scratch(int64_t width);
 template <class T>
-void filter_plane(const Window<T> &, int64_t plane, T *line);
+void filter_plane(const Window<T> &, int64_t plane, T *scratch);
+int64_t similarity_scratch(int64_t width);
+template <class T>
+void similarity_plane(const Similarity<T> &, int64_t channel, T *scratch);
+template <class T>
+ErrorSum squared_error_chunk(const SquaredError<T> &, int64_t begin, int64_t end);
+template <class T>
+void squared_error_chunk_backward(const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end);
 
 template <class T>
 void freeze(const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights);

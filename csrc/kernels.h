@@ -9,6 +9,7 @@
 #include <cstdint>
 
 #include "attention.h"
+#include "squared_error.h"
 #include "window.h"
 
 namespace vlgs {
@@ -173,8 +174,14 @@ struct Kernels {
   // A yardstick: `rounds` times kYardstick multiply-adds of 16 lanes, none of which waits for another of its
   // round.
   T (*multiply_add)(int64_t rounds, T factor, T addend);
-  // One plane; line has room for width + kTaps numbers.
-  void (*filter_plane)(const Window<T> &, int64_t plane, T *line);
+  // One plane, one channel; with scratch as large as its *_scratch says for a width.
+  int64_t (*window_scratch)(int64_t width);
+  void (*filter_plane)(const Window<T> &, int64_t plane, T *scratch);
+  int64_t (*similarity_scratch)(int64_t width);
+  void (*similarity_plane)(const Similarity<T> &, int64_t channel, T *scratch);
+  // Pixels [begin, end), few enough for sums in T.
+  ErrorSum (*squared_error)(const SquaredError<T> &, int64_t begin, int64_t end);
+  void (*squared_error_backward)(const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end);
 };
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.

@@ -1,4 +1,4 @@
-// The window of SSIM: a symmetric filter along both sides of an image.
+// The window of SSIM: a symmetric filter along both sides of an image, and what it is for.
 #pragma once
 
 #include <cstdint>
@@ -16,7 +16,19 @@ struct Window {
   T *out;
 };
 
+// Structural similarity of two images [height, width, channels], one value per channel and pixel: from the
+// moments of p = a + b and q = a - b (vlgs/losses.py, `ssim_map`).
+template <class T>
+struct Similarity {
+  int64_t height, width, channels;
+  const T *a, *b, *taps;
+  T luminance_floor, structure_floor;  // added to both sides of the two ratios
+  T *out;                              // [channels, height, width]
+};
+
 template <class T>
 void filter(const Window<T> &, int threads);
+template <class T>
+void similarity(const Similarity<T> &, int threads);
 
 }  // namespace vlgs

@@ -135,6 +135,26 @@ def view_color_backward(
     threads: int,
 ) -> None: ...
 def filter(planes: Tensor, taps: Tensor, out: Tensor, threads: int) -> None: ...
+def similarity(
+    a: Tensor,
+    b: Tensor,
+    taps: Tensor,
+    luminance_floor: float,
+    structure_floor: float,
+    out: Tensor,
+    threads: int,
+) -> None: ...
+def squared_error(a: Tensor, b: Tensor, valid: Tensor | None, threads: int) -> tuple[float, int]:
+    """Sum of squared differences over the pixels that count, and their number."""
+
+def squared_error_backward(
+    a: Tensor,
+    b: Tensor,
+    valid: Tensor | None,
+    scale: float,
+    d_a: Tensor,
+    threads: int,
+) -> None: ...
 
 class FrozenFloat:
     def __init__(self, picture: BlendFloat, threads: int) -> None: ...

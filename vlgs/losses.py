@@ -11,7 +11,8 @@ from typing import Any, Literal, cast
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import l1_loss, mse_loss
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import l1_loss
 
 from vlgs import _csrc
 
@@ -45,10 +46,7 @@ def masked_mse(
         (tensor(4.), tensor(2.))
     """
     _require_shapes("masked_mse", render, target, valid)
-    if valid is None:
-        return mse_loss(render, target)
-    total = mse_loss(render, _filled(target, valid, render), reduction="sum")
-    return total / _count(render, valid, pixels)
+    return cast(Tensor, _SquaredError.apply(render, target, valid, pixels))
 
 
 def masked_l1(
@@ -114,6 +112,8 @@ def ssim_map(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tens
     _require_shapes("ssim", a, b)
     if a.numel() == 0:
         raise ValueError(f"ssim: images must have pixels, got shape {tuple(a.shape)}")
+    if not (torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)):
+        return _similarity(a, b)
     total, gap = (a + b).permute(2, 0, 1), (a - b).permute(2, 0, 1)
     moments = _filter(torch.cat([total, gap, total.square(), gap.square()]))
     mean_p, mean_q, square_p, square_q = moments.chunk(4)
@@ -220,6 +220,37 @@ class Losses:
 
 
 _LANGUAGE = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
+
+
+class _SquaredError(torch.autograd.Function):
+    """`masked_mse`; csrc/squared_error.cpp."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, target: Tensor, valid: Tensor | None, pixels: Pixels):
+        render, target = render.contiguous(), target.contiguous()
+        valid = None if valid is None else valid.contiguous()
+        total, count = _csrc.squared_error(render, target, valid, torch.get_num_threads())
+        ctx.save_for_backward(render, target, valid)
+        ctx.numbers = max(render.numel() if pixels == "all" else count * render.shape[-1], 1)
+        return render.new_tensor(total / ctx.numbers)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_loss: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        render, target, valid = ctx.saved_tensors
+        d_render = torch.empty_like(render)
+        scale = 2 * (d_loss / ctx.numbers).item()
+        threads = torch.get_num_threads()
+        _csrc.squared_error_backward(render, target, valid, scale, d_render, threads)
+        return d_render, -d_render if ctx.needs_input_grad[1] else None, None, None
+
+
+def _similarity(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
+    """`ssim_map` without a gradient, to the bit, in one pass; csrc/window.cpp."""
+    a, b = a.contiguous(), b.contiguous()
+    out = a.new_empty(a.shape[2], *a.shape[:2])
+    _csrc.similarity(a, b, _taps(a.dtype), 2 * SSIM_C1, 2 * SSIM_C2, out, torch.get_num_threads())
+    return out.permute(1, 2, 0)
 
 
 def _filter(planes: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:

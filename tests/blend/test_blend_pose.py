@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from vlgs.blend import BetaBlend, blend_camera, slerp
+from vlgs.blend import BetaBlend, blend_camera, blend_cameras, slerp
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat
 from vlgs.types import Camera
 
@@ -238,3 +238,21 @@ def test_bad_pairs_are_refused():
         blend_camera(camera(1), camera(2, width=65), 0.5, BetaBlend())
     with pytest.raises(ValueError, match="k must be finite, got nan"):
         blend_camera(camera(1), camera(2), float("nan"), BetaBlend())
+
+
+@pytest.mark.parametrize("convention", ["consistent", "paper"])
+@pytest.mark.parametrize("kept", ["first", "nearer"])
+@pytest.mark.parametrize(("rotation", "translation"), [(True, True), (True, False), (False, True)])
+def test_many_pairs_at_once_are_each_pair_alone_to_the_bit(
+    convention, kept, rotation: bool, translation: bool
+):
+    blend = BetaBlend(rotation=rotation, translation=translation, convention=convention, kept=kept)
+    ones = [camera(seed, torch.float32) for seed in range(20)]
+    twos = [camera(seed, torch.float32) for seed in range(20, 40)]
+    ks = [0.0, 1.0, 0.5, 1e-9, *torch.rand(16, dtype=torch.float64).tolist()]
+    together = blend_cameras(ones, twos, ks, blend)
+    for one, two, k, got in zip(ones, twos, ks, together, strict=True):
+        alone = blend_camera(one, two, k, blend)
+        assert torch.equal(got.viewmat, alone.viewmat)
+        assert torch.equal(got.K, alone.K)
+    assert blend_cameras([], [], [], blend) == []

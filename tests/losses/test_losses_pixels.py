@@ -159,3 +159,58 @@ def test_bad_input_is_refused(monkeypatch: pytest.MonkeyPatch):
             loss(torch.zeros(2, 3, 1), torch.zeros(2, 3, 1), VALID)
     with pytest.raises(ValueError, match=r"must have pixels, got shape \(0, 4, 3\)"):
         ssim(torch.zeros(0, 4, 3), torch.zeros(0, 4, 3))
+
+
+def plain_mse(render: Tensor, target: Tensor, valid: Tensor | None, pixels: str) -> Tensor:
+    """`masked_mse` in the words of its definition."""
+    errors = (render - target).square()
+    if valid is None:
+        return errors.mean()
+    total = torch.where(valid[..., None], errors, 0).sum()
+    return total / (errors.numel() if pixels == "all" else valid.sum() * errors.shape[-1])
+
+
+@pytest.mark.parametrize("pixels", ["valid", "all"])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [(1, 17, 1), (13, 7, 3), (40, 31, 16), (3, 5, 512)])
+def test_squared_error_is_its_definition(size: tuple[int, int, int], masked: bool, pixels):
+    g = torch.Generator().manual_seed(sum(size))
+    render, target = torch.randn(2, *size, generator=g, dtype=torch.float64)
+    # Stretches of many lengths, as in the masks of photographs, and single pixels.
+    valid = torch.rand(size[:2], generator=g).cumsum(1).sin() > -0.3 if masked else None
+    for kind, tolerance in ((torch.float64, 1e-13), (torch.float32, 1e-6)):
+        one, two = (render.to(kind, copy=True).requires_grad_() for _ in range(2))
+        got = masked_mse(one, target.to(kind), valid, pixels)
+        want = plain_mse(two, target.to(kind), valid, pixels)
+        torch.testing.assert_close(got, want, rtol=tolerance, atol=0)
+        got.mul(0.7).backward()
+        want.mul(0.7).backward()
+        torch.testing.assert_close(one.grad, two.grad, rtol=tolerance, atol=1e-20)
+
+
+def test_squared_error_reaches_the_target_and_takes_any_layout():
+    render, target = maps()
+    assert torch.autograd.gradcheck(
+        lambda a, b: masked_mse(a, b, VALID), (render, target.requires_grad_())
+    )
+    turned = render.detach().permute(1, 0, 2)
+    assert not turned.is_contiguous()
+    got = masked_mse(turned, target.permute(1, 0, 2), VALID.T)
+    assert got.item() == pytest.approx(masked_mse(render, target, VALID).item(), rel=1e-14)
+
+
+def test_squared_error_has_the_same_bits_for_any_number_of_threads():
+    g = torch.Generator().manual_seed(0)
+    render, target = torch.rand(2, 700, 401, 3, generator=g)
+    valid = torch.rand(700, 401, generator=g) > 0.3
+    before, seen = torch.get_num_threads(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        leaf = render.clone().requires_grad_()
+        loss = masked_mse(leaf, target, valid)
+        loss.backward()
+        seen.append((loss.detach(), leaf.grad))
+    torch.set_num_threads(before)
+    for loss, gradient in seen[1:]:
+        assert torch.equal(loss, seen[0][0])
+        assert torch.equal(gradient, seen[0][1])

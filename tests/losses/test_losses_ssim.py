@@ -124,3 +124,27 @@ def test_similarity_of_views_is_never_negative_and_has_no_gradient():
     assert view_similarity(a, 1 - a) == 0.0
     assert view_similarity(a, a) == 1.0
     assert 0 < view_similarity(a, a + 0.1) < 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [(1, 1), (4, 30), (30, 4), (11, 12), (57, 83)])
+def test_without_a_gradient_the_map_keeps_every_bit(size: tuple[int, int], dtype: torch.dtype):
+    a, b = pair(*size, dtype=dtype)
+    want = ssim_map(a.clone().requires_grad_(), b).detach()
+    before = torch.get_num_threads()
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        got = ssim_map(a, b)
+        assert torch.equal(got, want)
+        assert got.stride() == want.stride()  # a mean adds in the order of memory
+    torch.set_num_threads(before)
+    assert torch.equal(ssim_map(a.flip(1), b.transpose(0, 1).contiguous().transpose(0, 1)),
+                       ssim_map(a.flip(1).contiguous(), b))  # fmt: skip
+
+
+def test_a_pixel_that_is_not_finite_spoils_its_window_alone():
+    a, b = pair(30, 31)
+    a[15, 16, 1] = math.nan
+    spoiled = ssim_map(a, b).isnan()
+    assert spoiled.sum() == 11 * 11
+    assert spoiled[10:21, 11:22, 1].all()

@@ -158,12 +158,12 @@ def test_a_reused_view_is_near(tiny_scene: Scene):
     reused, worst = 0, 0.0
     for _ in range(400):
         k = blend.draw(rng)
-        plan = plan_blend(cameras, k, 1.0, 1.0, blend, delta)
+        true = blend_camera(*cameras, k, blend)
+        plan = plan_blend(cameras, k, true, 1.0, 1.0, blend, delta)
         if plan.reuse is None:
             assert delta <= k <= 1 - delta
             continue
         reused += 1
-        true = blend_camera(*cameras, k, blend)
         off, turned = pose_error(plan.camera, true)
         assert off <= delta * distance + 1e-6
         assert turned <= delta * angle + 1e-6
@@ -190,7 +190,8 @@ def test_only_a_view_that_is_there_is_reused(
 ):
     cameras = tiny_scene.train[0].camera, tiny_scene.train[3].camera
     blend = BetaBlend(**switches)  # pyright: ignore[reportArgumentType]
-    assert plan_blend(cameras, k, 1.0, 1.0, blend, 0.01).reuse == reuse
+    between = blend_camera(*cameras, k, blend)
+    assert plan_blend(cameras, k, between, 1.0, 1.0, blend, 0.01).reuse == reuse
 
 
 @pytest.mark.parametrize("value", ["0.0", "1.0"])

@@ -1,5 +1,6 @@
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -154,6 +155,28 @@ def test_a_non_finite_gradient_names_its_row(tiny_scene: Scene, tmp_path: Path, 
         match=rf"gradient of splats\.{name} must be finite, .* in row 7 in step 0",
     ):
         train(module, tmp_path)
+
+
+def test_densification_is_part_of_the_training_time(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    clock = {"now": 0.0}
+
+    def slow_densify(*args: object) -> None:
+        clock["now"] += 100.0
+
+    now = SimpleNamespace(perf_counter=lambda: clock["now"])
+    monkeypatch.setattr("vlgs.module.callbacks.time", now)
+    monkeypatch.setattr("vlgs.module.callbacks.densify", slow_densify)
+    module = train(module_of(tiny_scene, "trainer.iterations=9"), tmp_path)
+    assert module.train_seconds == 200  # after 4 and 8 iterations
+
+
+def test_a_large_gradient_is_no_fault(tiny_scene: Scene, tmp_path: Path):
+    """Its square is infinite in float32, it is not."""
+    module = module_of(tiny_scene, "trainer.iterations=1")
+    module.model.splats["features"].register_hook(lambda gradient: gradient.clamp_min(1e30))
+    assert train(module, tmp_path).next_step == 1
 
 
 def test_a_view_that_sees_nothing_trains_on(tiny_scene: Scene, tmp_path: Path):

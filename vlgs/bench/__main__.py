@@ -133,7 +133,7 @@ def overhead(parser: ArgumentParser) -> Runner:
 
 
 def iteration(parser: ArgumentParser) -> Runner:
-    """Parts of a training iteration by CPU time."""
+    """Parts of a training iteration by CPU time; fusion and Adam alone, by threads."""
     parser.add_argument("--sizes", type=int, nargs="+", help="rows of vlgs/bench/iteration.py")
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--threads", type=int, default=2)
@@ -142,8 +142,12 @@ def iteration(parser: ArgumentParser) -> Runner:
         import torch
         from rich.console import Console
 
+        from vlgs.bench.alone import measure_alone, show_alone
         from vlgs.bench.iteration import SIZES, measure_iteration, show_iterations
 
+        gaussians, repeats = (500, 2) if args.quick else (100_000, 3 * args.iterations)
+        alone = measure_alone(gaussians, (1, 2), repeats, args.seed)
+        Console().print(show_alone(gaussians, alone))
         torch.set_num_threads(args.threads)
         chosen = [0] if args.quick else args.sizes or range(len(SIZES))
         count = 3 if args.quick else args.iterations

@@ -1,6 +1,6 @@
 """Camera-view blending: a third camera between two real ones, and the language map it should see (Eqs. slerp, lerp, blend)."""
 
-from vlgs.blend.pose import blend_camera, slerp
+from vlgs.blend.pose import blend_camera, blend_cameras, slerp
 from vlgs.blend.ratio import BetaBlend, FixedBlend, GaussianBlend, NoBlend, UniformBlend, ViewBlend
 from vlgs.blend.target import blend_targets
 
@@ -12,6 +12,7 @@ __all__ = [
     "UniformBlend",
     "ViewBlend",
     "blend_camera",
+    "blend_cameras",
     "blend_targets",
     "slerp",
 ]

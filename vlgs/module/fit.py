@@ -72,9 +72,9 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     folder.path.mkdir(parents=True, exist_ok=True)
     stop = GracefulStop()
     callbacks: list[L.Callback] = [
-        TrainingClock(),
         StuckAlarm(module.settings.log_every),
         Densification(),
+        TrainingClock(),  # ends an iteration after its densification
         CurveLog(folder.curves, module.settings.log_every),
         Checkpoints(folder.checkpoint, module.settings.checkpoint_every, options.meta),
         stop,

@@ -3,19 +3,21 @@
 import math
 import time
 from dataclasses import dataclass
+from statistics import fmean
 
 import lightning as L
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 
 from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import scene_extent
-from vlgs.losses import Losses, view_similarity
-from vlgs.module.blended import BlendPlan, plan_blend
+from vlgs.losses import Losses, masked_mse, view_similarity
+from vlgs.module.blended import BlendPlan, CamerasBetween, plan_blend
 from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
 from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.settings import TrainerConfig
@@ -100,6 +102,7 @@ class VLGSModule(L.LightningModule):
         if blend.pairs == "neighbours":
             near = nearest_views([view.camera for view in scene.train], blend.neighbours)
         self.sampler = PairSampler(sizes, seed, near)
+        self.between = CamerasBetween(self.sampler, [v.camera for v in scene.train], blend)
         self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
@@ -161,7 +164,8 @@ class VLGSModule(L.LightningModule):
             self._refuse_non_finite_gradients(where)
         self.optimizer.step()
         self.next_step = step + 1
-        mse, weight = self._color_mse(renders, targets), 0.0 if plan is None else plan.weight
+        mse = self._color_mse(color_losses, renders, targets)
+        weight = 0.0 if plan is None else plan.weight
         self.report = StepReport(step, views, tuple(renders), float(total.detach()), mse, weight)
 
     def target(self, index: int) -> Target:
@@ -289,11 +293,9 @@ class VLGSModule(L.LightningModule):
         if weight <= least:
             self.skips.skip("blend_zero" if weight <= 0 else "blend_small")
             return None
-        k = self.blend.draw(self.sampler.ratio_rng(step))
-        cameras = first.view.camera, second.view.camera
-        return plan_blend(
-            cameras, k, similarity, weight, self.blend, self.settings.skip.blend_reuse
-        )
+        k, between = self.between.at(step)
+        cameras, reuse = (first.view.camera, second.view.camera), self.settings.skip.blend_reuse
+        return plan_blend(cameras, k, between, similarity, weight, self.blend, reuse)
 
     def _blended_loss(
         self,
@@ -320,23 +322,30 @@ class VLGSModule(L.LightningModule):
         assert feature is not None
         return self.losses.blended_loss(feature.view_as(codes), codes, valid, plan.similarity)
 
-    def _color_mse(self, renders: list[ViewRender], targets: tuple[Target, ...]) -> float:
-        with torch.no_grad():
-            errors = [
-                nn.functional.mse_loss(render.color, target.image)
-                for render, target in zip(renders, targets, strict=True)
-                if render.color is not None
-            ]
-            return float(torch.stack(errors).mean()) if errors else math.nan
+    @torch.no_grad()
+    def _color_mse(
+        self, losses: list[Tensor], renders: list[ViewRender], targets: tuple[Target, ...]
+    ) -> float:
+        errors = []
+        for loss, render, target in zip(losses, renders, targets, strict=True):
+            if render.color is None:
+                continue
+            known = self.losses.rgb_loss == "mse" and target.view.read_valid is None
+            errors.append((loss if known else masked_mse(render.color, target.image)).item())
+        return fmean(errors) if errors else math.nan
 
     def _refuse_non_finite_gradients(self, where: str) -> None:
         """Stop before Adam spreads one bad number over everything (pitfalls N1)."""
+        trained = (p.grad for group in self.optimizer.param_groups for p in group["params"])
+        # Finite only if every gradient is; the square of a large one can overflow, hence the search.
+        if torch.isfinite(get_total_norm([g for g in trained if g is not None])):
+            return
         for name, parameter in self.model.named_parameters():
             gradient = parameter.grad
-            if gradient is None or torch.isfinite(gradient.sum()):
+            if gradient is None:
                 continue
             rows = ~torch.isfinite(gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None])
-            if rows.any():  # a sum can overflow where every term is finite
+            if rows.any():
                 row = int(rows.any(dim=1).nonzero()[0])
                 raise FloatingPointError(
                     f"train: gradient of {name} must be finite, got {gradient[row].tolist()} in row {row} {where}"

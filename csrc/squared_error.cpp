@@ -1,0 +1,65 @@
+#include "squared_error.h"
+
+#include <cstring>
+
+#include "isa.h"
+#include "simd.h"
+
+namespace vlgs::VLGS_ISA_NS {
+namespace {
+
+// Calls with every stretch of pixels in [begin, end) that count or do not; masks are made of long ones.
+template <class Call>
+VLGS_INLINE void for_stretches(const bool *valid, int64_t begin, int64_t end, Call call) {
+  if (!valid) return call(begin, end, true);
+  while (begin < end) {
+    const void *other = std::memchr(valid + begin, !valid[begin], size_t(end - begin));
+    const int64_t stop = other ? static_cast<const bool *>(other) - valid : end;
+    call(begin, stop, valid[begin]);
+    begin = stop;
+  }
+}
+
+}  // namespace
+
+template <class T>
+ErrorSum squared_error_chunk(const SquaredError<T> &e, int64_t begin, int64_t end) {
+  Pack<T> sums = splat(T(0));
+  ErrorSum total = {0, 0};
+  for_stretches(e.valid, begin, end, [&](int64_t first, int64_t last, bool counts) {
+    if (!counts) return;
+    total.pixels += last - first;
+    int64_t i = first * e.channels;
+    const int64_t stop = last * e.channels;
+    for (; i + kLanes <= stop; i += kLanes) {
+      const Pack<T> gap = load(e.a + i) - load(e.b + i);
+      sums = sums + gap * gap;
+    }
+    for (; i < stop; ++i) {
+      const double gap = double(e.a[i] - e.b[i]);
+      total.sum += gap * gap;
+    }
+  });
+  T lanes[kLanes];
+  store(lanes, sums);
+  for (const T lane : lanes) total.sum += double(lane);
+  return total;
+}
+
+template <class T>
+void squared_error_chunk_backward(const SquaredError<T> &e, T scale, T *d_a, int64_t begin, int64_t end) {
+  for_stretches(e.valid, begin, end, [&](int64_t first, int64_t last, bool counts) {
+    const int64_t start = first * e.channels, stop = last * e.channels;
+    if (counts)
+      for (int64_t i = start; i < stop; ++i) d_a[i] = scale * (e.a[i] - e.b[i]);
+    else
+      for (int64_t i = start; i < stop; ++i) d_a[i] = 0;
+  });
+}
+
+template ErrorSum squared_error_chunk(const SquaredError<float> &, int64_t, int64_t);
+template ErrorSum squared_error_chunk(const SquaredError<double> &, int64_t, int64_t);
+template void squared_error_chunk_backward(const SquaredError<float> &, float, float *, int64_t, int64_t);
+template void squared_error_chunk_backward(const SquaredError<double> &, double, double *, int64_t, int64_t);
+
+}  // namespace vlgs::VLGS_ISA_NS
