@@ -1,3 +1,4 @@
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -152,6 +153,22 @@ def test_a_non_finite_gradient_names_its_row(tiny_scene: Scene, tmp_path: Path, 
     with pytest.raises(
         FloatingPointError,
         match=rf"gradient of splats\.{name} must be finite, .* in row 7 in step 0",
+    ):
+        train(module, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("log_scales", -math.inf), ("opacity_logits", math.inf), ("indicator_logits", -math.inf)],
+)
+def test_an_infinite_parameter_of_a_finite_picture_names_its_row(
+    tiny_scene: Scene, tmp_path: Path, name: str, value: float
+):
+    module = module_of(tiny_scene)
+    with torch.no_grad():
+        module.model.splats[name][7] = value
+    with pytest.raises(
+        FloatingPointError, match=rf"train: splats\.{name} must be finite, .* in row 7 in step 0"
     ):
         train(module, tmp_path)
 

@@ -156,7 +156,7 @@ class VLGSModule(L.LightningModule):
         else:  # nothing that is trained is in view, or neither view has a mask
             self.screen_gradients = tuple(torch.zeros_like(r.mean2d) for r in renders)
         if not self.settings.skip.finite_check:
-            self._refuse_non_finite_gradients(where)
+            self._refuse_non_finite(where)
         self.optimizer.step()
         self.next_step = step + 1
         mse, weight = self._color_mse(renders, targets), 0.0 if plan is None else plan.weight
@@ -318,18 +318,25 @@ class VLGSModule(L.LightningModule):
             ]
             return float(torch.stack(errors).mean()) if errors else math.nan
 
-    def _refuse_non_finite_gradients(self, where: str) -> None:
+    def _refuse_non_finite(self, where: str) -> None:
         """Stop before Adam spreads one bad number over everything (pitfalls N1)."""
         for name, parameter in self.model.named_parameters():
-            gradient = parameter.grad
-            if gradient is None or torch.isfinite(gradient.sum()):
-                continue
-            rows = ~torch.isfinite(gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None])
-            if rows.any():  # a sum can overflow where every term is finite
-                row = int(rows.any(dim=1).nonzero()[0])
-                raise FloatingPointError(
-                    f"train: gradient of {name} must be finite, got {gradient[row].tolist()} in row {row} {where}"
-                )
+            if parameter.grad is not None:
+                _require_finite(f"gradient of {name}", parameter.grad, where)
+            # Others are looked at where they are read; these come to a finite weight or scale, with no gradient, at infinity.
+            if name.endswith(("_logits", "log_scales")):
+                _require_finite(name, parameter.detach(), where)
+
+
+def _require_finite(name: str, tensor: Tensor, where: str) -> None:
+    if torch.isfinite(tensor.sum()):
+        return
+    rows = ~torch.isfinite(tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None])
+    if rows.any():  # a sum can overflow where every term is finite
+        row = int(rows.any(dim=1).nonzero()[0])
+        raise FloatingPointError(
+            f"train: {name} must be finite, got {tensor[row].tolist()} in row {row} {where}"
+        )
 
 
 def _covered(view: View) -> Bool[Tensor, "h w"] | None:

@@ -59,7 +59,9 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
     ours["indicator_logits"] = torch.full((n,), NOWHERE)
     ours["features"] = torch.zeros(n, theirs["features"].shape[1])
     if isinstance(language.indicator, Fixed):
-        theirs["indicator_logits"] = torch.full((m,), language.indicator.value).logit()
+        # A weight of exactly 1 has an infinite logit, which no file may hold.
+        value = torch.full((m,), language.indicator.value)
+        theirs["indicator_logits"] = value.logit().clamp(NOWHERE, -NOWHERE)
     both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in PARAMETERS}
     model = SplatModel(both, NoFusion(), Learned(), language.codec, color.raster, color.sh_degree)
     model.splats = nn.ParameterDict({k: nn.Parameter(v, False) for k, v in both.items()})
