@@ -349,6 +349,7 @@ NB_MODULE(_csrc, m) {
   // Graphs and caches of Python that outlive this module hold on to its objects; nanobind would call that a
   // leak.
   nb::set_leak_warnings(false);
+  isa();  // a wish that cannot be met ends the import; later it would be thrown inside a parallel loop
   m.def("isa", &isa);
   m.def("multiply_adds", &multiply_adds, "packs"_a);
   nb::class_<Camera>(m, "Camera")

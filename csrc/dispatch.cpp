@@ -1,23 +1,24 @@
-// Which instruction set runs: the best that both the machine and VLGS_ISA allow, decided once.
+// Which instruction set runs: the best that this build has and that both the machine and VLGS_ISA allow,
+// decided once.
+#include <algorithm>
+#include <cstddef>
 #include <cstdlib>
+#include <iterator>
 #include <stdexcept>
 #include <string>
 
 #include "kernels.h"
 
-namespace vlgs {
-
-#define VLGS_DECLARE(ns)                \
-  namespace ns {                        \
-  extern const Kernels<float> kFloat;   \
-  extern const Kernels<double> kDouble; \
+// VLGS_BUILT is X(v4) X(v3) X(base), or what CMakeLists.txt was asked for of it.
+#define X(set)                            \
+  namespace vlgs::isa_##set {             \
+    extern const Kernels<float> kFloat;   \
+    extern const Kernels<double> kDouble; \
   }
-VLGS_DECLARE(isa_base)
-#if defined(VLGS_X86)
-VLGS_DECLARE(isa_v3)
-VLGS_DECLARE(isa_v4)
-#endif
+VLGS_BUILT
+#undef X
 
+namespace vlgs {
 namespace {
 
 struct Choice {
@@ -26,18 +27,37 @@ struct Choice {
   const Kernels<double> *full;
 };
 
+#define X(set) {#set, &isa_##set::kFloat, &isa_##set::kDouble},
+constexpr Choice kBuilt[] = {VLGS_BUILT};
+#undef X
+
+constexpr const char *kBestFirst[] = {"v4", "v3", "base"};
+
+std::ptrdiff_t rank(const std::string &name) {
+  return std::find(std::begin(kBestFirst), std::end(kBestFirst), name) - std::begin(kBestFirst);
+}
+
+bool runs_here(const std::string &name) {
+#if defined(__x86_64__)
+  if (name == "v4") return __builtin_cpu_supports("x86-64-v4");
+  if (name == "v3") return __builtin_cpu_supports("x86-64-v3");
+#endif
+  return name == "base";
+}
+
 Choice choose() {
   const char *wish = std::getenv("VLGS_ISA");
-  const std::string limit = wish ? wish : "v4";
-  if (limit != "v4" && limit != "v3" && limit != "base")
+  const std::string limit = wish ? wish : kBestFirst[0];
+  if (rank(limit) == std::ssize(kBestFirst))
     throw std::invalid_argument("VLGS_ISA: must be v4, v3 or base, got " + limit);
-#if defined(VLGS_X86)
-  __builtin_cpu_init();
-  if (limit == "v4" && __builtin_cpu_supports("x86-64-v4")) return {"v4", &isa_v4::kFloat, &isa_v4::kDouble};
-  if (limit != "base" && __builtin_cpu_supports("x86-64-v3"))
-    return {"v3", &isa_v3::kFloat, &isa_v3::kDouble};
-#endif
-  return {"base", &isa_base::kFloat, &isa_base::kDouble};
+  std::string names;
+  for (const Choice &built : kBuilt) {
+    if (rank(built.name) >= rank(limit) && runs_here(built.name)) return built;
+    names += std::string(names.empty() ? "" : ", ") + built.name;
+  }
+  throw std::invalid_argument(
+      "VLGS_ISA: must allow an instruction set of this machine that this build has (" + names + "), got " +
+      limit);
 }
 
 const Choice &choice() {

@@ -1,11 +1,13 @@
-"""Fuzz the rasterizer under AddressSanitizer and UndefinedBehaviorSanitizer: `python csrc/sanitize.py --scenes 2000`.
+"""Fuzz the kernels under AddressSanitizer and UndefinedBehaviorSanitizer: `python csrc/sanitize.py --isa v4 --scenes 10000`.
 
-Builds the extension apart, in build/sanitize, and runs `vlgs.bench.fuzz` on it once per instruction set. The first finding ends
-the process with the sanitizer's report and a non-zero exit; the last seed printed is the one that it was in.
+Builds the extension apart, in build/sanitize, with the instruction sets asked for, and runs `vlgs.bench.fuzz` on each: seeds from 0 on,
+in parts, each recorded in results/bench/fuzz.csv when it ends and not run again on the same code. The first finding ends a part
+with the sanitizer's report; the seed that it was in is named. `--first SEED --scenes 1` runs one scene again and records nothing.
 """
 
 import argparse
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -13,10 +15,12 @@ from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parent
 BUILD = SOURCE.parent / "build" / "sanitize"
+RECORD = SOURCE.parent / "results" / "bench" / "fuzz.csv"
+SANITIZERS = "address, undefined"
 RUNTIMES = ("libasan.so", "libstdc++.so.6")  # the second, or an exception is thrown past the first
 
 
-def build() -> Path:
+def build(isas: list[str]) -> Path:
     """Compile with -DVLGS_SANITIZE=ON; returns the module."""
     nanobind = subprocess.check_output(
         [sys.executable, "-m", "nanobind", "--cmake_dir"], text=True
@@ -24,13 +28,13 @@ def build() -> Path:
     configure = ["cmake", "-S", str(SOURCE), "-B", str(BUILD), "-G", "Ninja"]
     configure += ["-DVLGS_SANITIZE=ON", "-DCMAKE_BUILD_TYPE=Release", f"-Dnanobind_DIR={nanobind}"]
     configure += [f"-DPython_EXECUTABLE={sys.executable}", "-DVLGS_NOSTRIP=NOSTRIP"]
-    subprocess.check_call(configure)
+    subprocess.check_call([*configure, f"-DVLGS_ISAS={';'.join(isas)}"])
     subprocess.check_call(["cmake", "--build", str(BUILD)])
     return next(BUILD.glob("_csrc*.so"))
 
 
-def fuzz(module: Path, first: int, scenes: int) -> None:
-    """In the child process: put the module in the place of the installed one, then fuzz."""
+def fuzz_here(module: Path, isa: str, seeds: range) -> None:
+    """In the child process: put the module in the place of the installed one, fuzz, print the report as the last line."""
     spec = importlib.util.spec_from_file_location("vlgs._csrc", module)
     assert spec is not None
     assert spec.loader is not None
@@ -40,36 +44,64 @@ def fuzz(module: Path, first: int, scenes: int) -> None:
     from vlgs.bench.fuzz import fuzz
 
     assert _csrc.__file__ == str(module)
-    report = fuzz(range(first, first + scenes), verbose=True)
-    print(f"{_csrc.isa()} under the sanitizers: {report}")
-    sys.exit(bool(report.failures))
+    if _csrc.isa() != isa:
+        sys.exit(f"sanitize: the CPU must have {isa}, got {_csrc.isa()} at best")
+    print(json.dumps(vars(fuzz(seeds, verbose=True))))
 
 
-def main() -> None:
-    """Build, then one child per instruction set."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=2000)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--isa", nargs="+", default=["base", "v3", "v4"])
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.child:
-        return fuzz(args.child, args.first, args.scenes)
-    module = build()
+def fuzz_in_child(module: Path, isa: str, seeds: range):
+    """A report of some seeds; a process that ended before its report failed in the seed it had announced last."""
+    from vlgs.bench.fuzz import FuzzReport
+
     found = [subprocess.check_output(["gcc", f"-print-file-name={r}"], text=True) for r in RUNTIMES]
     environment = os.environ | {
+        "VLGS_ISA": isa,
         "LD_PRELOAD": " ".join(path.strip() for path in found),
         # Python and torch keep memory until the end; a leak of theirs is not looked for.
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0",
         "UBSAN_OPTIONS": "print_stacktrace=1",
     }
-    command = [sys.executable, __file__, "--child", str(module)]
-    command += ["--first", str(args.first), "--scenes", str(args.scenes)]
-    codes = [
-        subprocess.run(command, env=environment | {"VLGS_ISA": isa}, check=False).returncode
-        for isa in args.isa
-    ]
-    sys.exit(max(map(abs, codes)))
+    command = [sys.executable, __file__, "--child", str(module), "--isa", isa]
+    command += ["--first", str(seeds.start), "--scenes", str(len(seeds))]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        last = ""
+        for line in child.stdout:
+            last = line.strip()
+    if last.startswith("{"):
+        report = json.loads(last)
+        failures = {int(seed): what for seed, what in report.pop("failures").items()}
+        return FuzzReport(**report, failures=failures)
+    if not last.startswith("seed "):
+        sys.exit(f"sanitize: the process of {isa} must run scenes, got status {child.returncode}")
+    return FuzzReport(failures={int(last.split()[1]): f"ended with status {child.returncode}"})
+
+
+def main() -> None:
+    """Build, then the fuzz on one instruction set after the other."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=2000, help="in all, with those recorded")
+    parser.add_argument("--first", type=int, help="first seed; default: 0, and record")
+    parser.add_argument("--isa", nargs="+", default=["v4", "v3", "base"])
+    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    seeds = range(args.first or 0, (args.first or 0) + args.scenes)
+    if args.child:
+        return fuzz_here(args.child, args.isa[0], seeds)
+    from vlgs.bench.fuzz_sheet import CLEAN, run_fuzz
+
+    module, failed = build(args.isa), False
+    for isa in args.isa:
+        if args.first is None:
+            row = run_fuzz(
+                isa, SANITIZERS, args.scenes, lambda s, i=isa: fuzz_in_child(module, i, s), RECORD
+            )
+            failed |= row.outcome != CLEAN
+        else:
+            report = fuzz_in_child(module, isa, seeds)
+            print(f"{isa}: {report}")
+            failed |= bool(report.failures)
+    sys.exit(failed)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,13 @@ namespace vlgs::VLGS_ISA_NS {
 
 constexpr int kLanes = 16;
 
-// Packs that travel through a call travel through memory.
+// Packs that travel through a call travel through memory. Sanitizers look on there: what they add to code
+// that is inlined everywhere takes the compiler minutes.
+#if defined(__SANITIZE_ADDRESS__)
+#define VLGS_INLINE inline
+#else
 #define VLGS_INLINE inline __attribute__((always_inline))
+#endif
 
 #if defined(__AVX512F__)
 constexpr int kNativeBytes = 64;

@@ -1,3 +1,4 @@
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -177,6 +178,22 @@ def test_a_large_gradient_is_no_fault(tiny_scene: Scene, tmp_path: Path):
     module = module_of(tiny_scene, "trainer.iterations=1")
     module.model.splats["features"].register_hook(lambda gradient: gradient.clamp_min(1e30))
     assert train(module, tmp_path).next_step == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("log_scales", -math.inf), ("opacity_logits", math.inf), ("indicator_logits", -math.inf)],
+)
+def test_an_infinite_parameter_of_a_finite_picture_names_its_row(
+    tiny_scene: Scene, tmp_path: Path, name: str, value: float
+):
+    module = module_of(tiny_scene)
+    with torch.no_grad():
+        module.model.splats[name][7] = value
+    with pytest.raises(
+        FloatingPointError, match=rf"train: splats\.{name} must be finite, .* in row 7 in step 0"
+    ):
+        train(module, tmp_path)
 
 
 def test_a_view_that_sees_nothing_trains_on(tiny_scene: Scene, tmp_path: Path):

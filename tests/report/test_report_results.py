@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from vlgs.report.evaluate import Evaluation
-from vlgs.report.provenance import _cpu_model, commit, machine
+from vlgs.report.provenance import _cpu_model, commit, machine, same_code
 from vlgs.report.results import METRICS, metrics_table, write_metrics, write_queries
 from vlgs.report.summary import print_summary
 
@@ -148,6 +148,25 @@ def test_commit_of_a_checkout_and_of_an_installed_wheel(tmp_path: Path):
     (tmp_path / "conf" / "new.yaml").unlink()
     (package / "__init__.py").write_text("x = 1")
     assert commit(package) == f"{clean}+dirty"
+
+
+def test_two_commits_have_the_same_code_where_they_differ_elsewhere(tmp_path: Path):
+    package = tmp_path / "vlgs"
+    package.mkdir()
+    git(tmp_path, "init")
+    commits = []
+    for name in ("vlgs/__init__.py", "notes.txt", "vlgs/more.py"):
+        (tmp_path / name).write_text("")
+        git(tmp_path, "add", ".")
+        git(tmp_path, "commit", "-m", name)
+        commits.append(commit(package))
+    first, noted, more = commits
+    assert same_code(first, first, package)
+    assert same_code(first, noted, package)
+    assert not same_code(noted, more, package)
+    assert not same_code(first, f"{first}+dirty", package)
+    assert not same_code(None, None, package)
+    assert not same_code("0" * 40, first, package), "a commit that is not there"
 
 
 def test_machine_is_described(tmp_path: Path):

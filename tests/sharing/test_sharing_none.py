@@ -38,12 +38,12 @@ def trained(scene: Scene, folder: Path, color: bool, *overrides: str) -> VLGSMod
     return module
 
 
-@pytest.mark.parametrize("indicator", ["learned", "opacity", "fixed"])
+@pytest.mark.parametrize("indicator", ["learned", "opacity", "fixed", "fixed indicator.value=1.0"])
 def test_the_united_model_renders_what_each_set_does(
     tiny_scene: Scene, tmp_path: Path, indicator: str
 ):
     color = trained(tiny_scene, tmp_path, True)
-    language = trained(tiny_scene, tmp_path, False, f"indicator={indicator}")
+    language = trained(tiny_scene, tmp_path, False, *f"indicator={indicator}".split())
     assert color.model.count != language.model.count, "both must have densified on their own"
     both = unite(color.model, language.model)
     camera = tiny_scene.test[0].camera
@@ -57,6 +57,7 @@ def test_the_united_model_renders_what_each_set_does(
     assert code.abs().max() > 0
     torch.testing.assert_close(got.feature, code, rtol=0, atol=1e-6)
     assert both.count == color.model.count + language.model.count
+    assert all(value.isfinite().all() for value in both.splats.values())
 
 
 def test_language_alone_moves_its_weight_and_never_its_colour(tiny_scene: Scene, tmp_path: Path):

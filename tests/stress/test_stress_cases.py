@@ -5,10 +5,17 @@ from pathlib import Path
 import pytest
 
 from vlgs.bench import stress
+from vlgs.bench.sheet import read_sheet
 from vlgs.bench.stress.case import Case, Verdict
+from vlgs.bench.stress.sheet import run_cases, show_table
 
-SLOW = ("N1 poisoned gradients", "N1 hostile training")
-"""Trainings, of 20 seconds and more on a busy machine."""
+SLOW = (
+    "N1 poisoned gradients",
+    "N1 hostile training",
+    "N12 threads and repeats, v3",
+    "N12 threads and repeats, base",
+)
+"""Trainings, of 20 seconds and more on a busy machine, or in a process of their own."""
 
 
 def marked(case: Case):
@@ -36,8 +43,8 @@ def test_a_failure_and_an_exception_are_failures(tmp_path: Path):
         """Never."""
         raise RuntimeError("no")
 
-    results = list(stress.run_cases([Case("N1 a", fails), Case("N2 b", breaks)], full=False))
-    assert [verdict.passed for _, verdict, _ in results] == [False, False]
-    assert stress.show_table(results).row_count == 2
-    stress.write_csv(results, tmp_path / "out" / "stress.csv")
-    assert "RuntimeError: no" in (tmp_path / "out" / "stress.csv").read_text()
+    path = tmp_path / "out" / "stress.csv"
+    rows = run_cases([Case("N1 a", fails), Case("N2 b", breaks)], False, path)
+    assert [row.passed for row in rows] == [False, False]
+    assert show_table(rows).row_count == 2
+    assert list(read_sheet(path).measured) == ["7 (<= 3)", "RuntimeError: no"]

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from vlgs.bench import fuzz
-from vlgs.bench.fuzz import FuzzScene, make_scene, run_scene
+from vlgs.bench.fuzz import run_scene
+from vlgs.bench.fuzz_scene import SWITCHES, FuzzScene, make_scene
 from vlgs.types import ChannelGroup
 
 
@@ -26,8 +27,18 @@ def test_scenes_differ_in_everything_that_matters():
     assert {0, 1} < {len(scene.tensors["means"]) for scene in scenes}
     assert any(len(set(s.chain_of)) < len(s.chain_of) for s in scenes)
     assert {scene.tame for scene in scenes} == {True, False}
-    channels = {s.tensors[f"values{i}"].shape[1] for s in scenes for i in range(len(s.chain_of))}
-    assert channels == set(range(1, 41))
+    channels = [[s.tensors[f"values{i}"].shape[1] for i in range(len(s.chain_of))] for s in scenes]
+    assert {c for each in channels for c in each} == set(range(1, 41))
+    assert sum(set(each) == {3} for each in channels) > 100
+    shapes = [s.shape_of for s in scenes]
+    assert any(set(each) == {None} for each in shapes)
+    assert any({None, 0, 1} <= set(each) for each in shapes)
+    assert any(each.count(0) > 1 for each in shapes), "two groups with one shape of their own"
+    assert {scene.threads for scene in scenes} == {1, 2, 3}
+    for switch in SWITCHES:
+        assert {getattr(scene.config, switch) for scene in scenes} == {True, False}
+    assert any(not scene.asked for scene in scenes)
+    assert any(scene.asked and len(scene.used) < len(scene.upstream) for scene in scenes)
 
 
 def first_tame() -> FuzzScene:
@@ -40,6 +51,25 @@ def test_a_refused_tame_scene_is_a_failure():
     with pytest.raises(AssertionError, match="a tame scene was refused: rasterize: means must be"):
         run_scene(scene)
     assert "means must be finite" in (run_scene(replace(scene, tame=False)) or "")
+
+
+def test_a_shape_of_its_own_is_drawn_and_refused_by_name():
+    scene = next(
+        s for s in map(make_scene, range(300))
+        if s.tame and s.shape_of[0] == 0 and len(s.tensors["means"]) > 2
+    )  # fmt: skip
+    scene.tensors["shape0.scales"][1, 2] = -1.0
+    message = run_scene(replace(scene, tame=False)) or ""
+    assert "scales must be finite and >= 0, got -1.000000 in row 1" in message
+    assert message.endswith("of a group's own shape")
+
+
+def test_what_is_drawn_beyond_what_may_be_seen_is_a_failure(monkeypatch: pytest.MonkeyPatch):
+    def blind(gaussians, *rest):
+        return torch.zeros(len(gaussians.means), dtype=torch.bool)
+
+    monkeypatch.setattr(fuzz, "may_see", blind)
+    assert "drawn that none may see" in str(fuzz.fuzz(range(20)))
 
 
 @pytest.mark.parametrize(

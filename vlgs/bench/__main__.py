@@ -191,47 +191,46 @@ def protocols(parser: ArgumentParser) -> Runner:
 
 
 def stress(parser: ArgumentParser) -> Runner:
-    """Hostile input, case by case: criterion, measured, passed; 1 if one failed."""
-    parser.add_argument("--only", nargs="+", default=[], metavar="CASE", help="names or parts")
+    """Hostile input, case by case: criterion, measured, passed; 1 if one failed. What passed on this code is not run again."""
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="CASE", help="names or parts: run, not recorded"
+    )
 
     def run(args: Namespace) -> int:
         from rich.console import Console
 
-        from vlgs.bench import stress as cases_of
+        from vlgs.bench.stress import CASES
+        from vlgs.bench.stress.sheet import run_cases, show_table
 
-        cases = [
-            case
-            for case in cases_of.CASES
-            if not args.only or any(part in case.name for part in args.only)
-        ]
+        cases = [c for c in CASES if not args.only or any(part in c.name for part in args.only)]
         if not cases:
             raise ValueError(f"stress: --only must match a case, got {' '.join(args.only)}")
-        console, results = Console(), []
-        for result in cases_of.run_cases(cases, full=not args.quick):
-            results.append(result)
-            case, verdict, seconds = result
-            word = "passed" if verdict.passed else "FAILED"
-            console.print(f"{case.name}: {word} in {seconds:.1f} s")
-        console.print(cases_of.show_table(results), width=max(console.width, 140))
-        if not args.only:  # a part of the cases never replaces the file of all
-            cases_of.write_csv(results, args.out / "stress.csv")
-        return int(any(not verdict.passed for _, verdict, _ in results))
+        path = None if args.only else args.out / "stress.csv"
+        rows = run_cases(cases, not args.quick, path)
+        console = Console()
+        console.print(show_table(rows), width=max(console.width, 140))
+        return int(any(not row.passed for row in rows))
 
     return run
 
 
 def fuzz(parser: ArgumentParser) -> Runner:
-    """Random hostile scenes through the rasterizer; 1 if one was answered wrongly."""
-    parser.add_argument("--scenes", type=int, default=10_000)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
+    """Random hostile scenes through the kernels, recorded in fuzz.csv; 1 if one was answered wrongly."""
+    parser.add_argument("--scenes", type=int, default=10_000, help="in all, with those recorded")
+    parser.add_argument("--first", type=int, help="first seed; default: 0, and record")
 
     def run(args: Namespace) -> int:
-        from vlgs.bench.fuzz import fuzz as run_fuzz
+        from vlgs import _csrc
+        from vlgs.bench.fuzz import fuzz as run_seeds
+        from vlgs.bench.fuzz_sheet import CLEAN, run_fuzz
 
         count = 20 if args.quick else args.scenes
-        report = run_fuzz(range(args.first, args.first + count))
-        print(report)
-        return int(bool(report.failures))
+        if args.first is not None:
+            report = run_seeds(range(args.first, args.first + count))
+            print(report)
+            return int(bool(report.failures))
+        row = run_fuzz(_csrc.isa(), "none", count, run_seeds, args.out / "fuzz.csv")
+        return int(row.outcome != CLEAN)
 
     return run
 

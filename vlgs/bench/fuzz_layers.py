@@ -1,4 +1,4 @@
-"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, the window of SSIM, frozen views.
+"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, the window of SSIM, frozen views, the yardstick.
 
 What `vlgs.bench.fuzz` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
 four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite.
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vlgs import _csrc
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.gaussians.sh import view_color
 from vlgs.losses import ssim_map
@@ -37,6 +38,8 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
     for run in (_attention, _view_color, _window):
         bad = float(rng.choice(poison)) if rng.random() < 0.25 else None
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
+    packs = int(rng.integers(0, 1000))
+    _require(_csrc.multiply_adds(packs) >= packs, "the yardstick did less than it was asked for")
 
 
 def run_frozen(
@@ -45,7 +48,7 @@ def run_frozen(
     """The first group of a scene as a frozen view: the same picture to rounding, finite gradients.
 
     Args:
-        tensors: Of a `vlgs.bench.fuzz.FuzzScene` that was rendered without complaint.
+        tensors: Of a `vlgs.bench.fuzz_scene.FuzzScene` that was rendered without complaint.
         width: Pixels.
         height: Pixels.
         config: The scene's.
@@ -55,9 +58,8 @@ def run_frozen(
         AssertionError: If the pictures differ, or a gradient is not finite.
     """
     camera = Camera(tensors["viewmat"], tensors["K"], width, height)
-    view = FrozenView(
-        tensors["means"], tensors["quats"], tensors["scales"], tensors["weight0"], camera, config
-    )
+    geometry = [tensors[name] for name in ("means", "quats", "scales", "weight0")]
+    view = FrozenView(*geometry, camera, config)
     values = tensors["values0"].clone().requires_grad_()
     image = view.render(values)
     # Sums of up to 200 terms in another order.

@@ -118,7 +118,7 @@ def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
     yield module, "target", "targets"
     yield module, "similarity", "similarity of the views"
     yield module, "_backward", "backward of the rest"
-    yield module, "_refuse_non_finite_gradients", "finite check"
+    yield module, "_refuse_non_finite", "finite check"
     yield module, "_color_loss", "losses, forward"
     yield module, "_language_loss", "losses, forward"
     yield module, "_color_mse", "PSNR of the step"

@@ -161,7 +161,7 @@ class VLGSModule(L.LightningModule):
         else:  # nothing that is trained is in view, or neither view has a mask
             self.screen_gradients = tuple(torch.zeros_like(r.mean2d) for r in renders)
         if not self.settings.skip.finite_check:
-            self._refuse_non_finite_gradients(where)
+            self._refuse_non_finite(where)
         self.optimizer.step()
         self.next_step = step + 1
         mse = self._color_mse(color_losses, renders, targets)
@@ -334,21 +334,24 @@ class VLGSModule(L.LightningModule):
             errors.append((loss if known else masked_mse(render.color, target.image)).item())
         return fmean(errors) if errors else math.nan
 
-    def _refuse_non_finite_gradients(self, where: str) -> None:
+    def _refuse_non_finite(self, where: str) -> None:
         """Stop before Adam spreads one bad number over everything (pitfalls N1)."""
-        trained = (p.grad for group in self.optimizer.param_groups for p in group["params"])
-        # Finite only if every gradient is; the square of a large one can overflow, hence the search.
-        if torch.isfinite(get_total_norm([g for g in trained if g is not None])):
-            return
+        looked_at: dict[str, Tensor] = {}
         for name, parameter in self.model.named_parameters():
-            gradient = parameter.grad
-            if gradient is None:
-                continue
-            rows = ~torch.isfinite(gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None])
+            if parameter.grad is not None:
+                looked_at[f"gradient of {name}"] = parameter.grad
+            # Others are looked at where they are read; these come to a finite weight or scale, with no gradient, at infinity.
+            if name.endswith(("_logits", "log_scales")):
+                looked_at[name] = parameter.detach()
+        # Finite only if every number is; the square of a large one can overflow, hence the search.
+        if torch.isfinite(get_total_norm(list(looked_at.values()))):
+            return
+        for name, tensor in looked_at.items():
+            rows = ~torch.isfinite(tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None])
             if rows.any():
                 row = int(rows.any(dim=1).nonzero()[0])
                 raise FloatingPointError(
-                    f"train: gradient of {name} must be finite, got {gradient[row].tolist()} in row {row} {where}"
+                    f"train: {name} must be finite, got {tensor[row].tolist()} in row {row} {where}"
                 )
 
 

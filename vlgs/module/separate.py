@@ -62,7 +62,9 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
     ours["indicator_logits"] = torch.full((n, *levels), NOWHERE)
     ours["features"] = torch.zeros(n, theirs["features"].shape[1])
     if isinstance(language.indicator, Fixed):
-        theirs["indicator_logits"] = torch.full((m,), language.indicator.value).logit()
+        # A weight of exactly 1 has an infinite logit, which no file may hold.
+        value = torch.full((m,), language.indicator.value)
+        theirs["indicator_logits"] = value.logit().clamp(NOWHERE, -NOWHERE)
     both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in PARAMETERS}
     indicator = language.indicator if isinstance(language.indicator, PerLevel) else Learned()
     model = SplatModel(both, NoFusion(), indicator, language.codec, color.raster, color.sh_degree)

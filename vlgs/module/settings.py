@@ -43,7 +43,7 @@ class SkipConfig:
     frozen_budget: int = 2 << 30
     """Bytes that the kept weights of all views may take together."""
     finite_check: bool = False
-    """Leave out the search for gradients that are not finite."""
+    """Leave out the search for gradients, logits and log-scales that are not finite."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.blend_reuse <= 0.5:

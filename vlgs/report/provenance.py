@@ -38,6 +38,13 @@ def commit(package: Path = PACKAGE) -> str | None:
     return f"{head}+dirty" if changed else head
 
 
+def same_code(one: str | None, other: str | None, package: Path = PACKAGE) -> bool:
+    """Whether two answers of `commit` stand for the same code and configuration; of what is not committed nobody knows."""
+    if one is None or other is None or "+dirty" in one + other:
+        return False
+    return _git(package, "diff", "--quiet", one, other, "--", ".", "../csrc", "../conf") is not None
+
+
 def _git(folder: Path, *arguments: str) -> str | None:
     """Output of a git command, None if it fails or there is no git."""
     try:

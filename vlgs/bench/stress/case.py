@@ -26,6 +26,8 @@ class Case:
     """Number in the list of known failures and a word: ``N4 needles``."""
     run: Callable[[bool], Verdict]
     """Takes whether the case is run at full size, as the command does, or small, as the tests do."""
+    minutes: int = 0
+    """About how long it takes one core at full size; the long ones run last."""
 
     @property
     def criterion(self) -> str:

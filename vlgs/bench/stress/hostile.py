@@ -321,7 +321,7 @@ def odd_quaternions(full: bool) -> Verdict:
 
 
 HOSTILE = (
-    Case("N2 poison", poison),
+    Case("N2 poison", poison, minutes=2),
     Case("N3 extreme scales", extreme_scales),
     Case("N4 needles", needles),
     Case("N5 near plane and edges", near_and_far),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from vlgs.bench.fuzz import WEIGHTS
+from vlgs.bench.fuzz_scene import WEIGHTS
 from vlgs.bench.stress.case import Case, Verdict, bound, relative_error
 from vlgs.bench.stress.splats import (
     full_screen,

@@ -1,0 +1,103 @@
+"""stress.csv: what each case measured, written case by case."""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from rich.table import Table
+
+from vlgs import _csrc
+from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
+from vlgs.bench.stress.case import Case, Verdict
+from vlgs.report.provenance import commit, same_code
+
+
+@dataclass(frozen=True)
+class StressRow:
+    """One case."""
+
+    case: str
+    criterion: str
+    measured: str
+    passed: bool
+    seconds: float
+    """Wall clock."""
+    cpu_seconds: float
+    """Of all threads and of the processes that the case started."""
+    isa: str
+    """Instruction set; N12 runs on all of them."""
+    commit: str | None
+
+
+def run_case(case: Case, full: bool) -> StressRow:
+    """Run one; an exception is a failure."""
+    wall, cpu = time.perf_counter(), sum(os.times()[:4])
+    try:
+        verdict = case.run(full)
+    except Exception as error:
+        verdict = Verdict(f"{type(error).__name__}: {error}", False)
+    return StressRow(
+        case.name, case.criterion, verdict.measured, verdict.passed,
+        round(time.perf_counter() - wall, 1), round(sum(os.times()[:4]) - cpu, 1), _csrc.isa(), commit(),
+    )  # fmt: skip
+
+
+def run_cases(cases: Sequence[Case], full: bool, path: Path | None) -> list[StressRow]:
+    """Run those that the file does not have as passed by the same code and instruction set, and write it after each.
+
+    The long ones run last, so that a run that is stopped leaves the most.
+
+    Args:
+        cases: In the order of the file.
+        full: Whether at full size.
+        path: Of the file; None runs all and writes nothing.
+    """
+    header = provenance(None)
+    for each in ("isa", "commit", "seed"):  # a matter of the row, and of the cases
+        del header[each]
+    known = _passed(path, commit(), _csrc.isa())
+    done = {case.name: known[case.name] for case in cases if case.name in known}
+    for case in sorted(cases, key=lambda c: c.minutes):
+        if case.name in done:
+            say(f"{case.name}: is there")
+            continue
+        row = done[case.name] = run_case(case, full)
+        say(f"{row.case}: {'passed' if row.passed else 'FAILED'} in {row.seconds:.1f} s")
+        if path is not None:
+            # Rows of cases yet to come stay out: they are of other code.
+            write_sheet(path, [done[c.name] for c in cases if c.name in done], header)
+    return [done[case.name] for case in cases]
+
+
+def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRow]:
+    """Rows of a file that need not be run again, by case."""
+    if path is None or not path.is_file():
+        return {}
+    table = read_sheet(path)
+    if list(table) != [field.name for field in fields(StressRow)]:  # of an older version
+        return {}
+    rows = [
+        StressRow(**{str(key): value for key, value in row.items()})
+        for row in table.to_dict("records")
+    ]
+    return {
+        row.case: row
+        for row in rows
+        if row.passed
+        and row.isa == isa
+        and isinstance(row.commit, str)
+        and same_code(row.commit, here)
+    }
+
+
+def show_table(rows: Sequence[StressRow]) -> Table:
+    """Case, criterion, what was measured, whether it passed."""
+    table = Table(title=f"vlgs stress, {_csrc.isa()}", show_lines=True)
+    for name in ("case", "criterion", "measured", "passed"):
+        table.add_column(name)
+    for row in rows:
+        passed = "yes" if row.passed else "[red]NO[/red]"
+        table.add_row(row.case, row.criterion, row.measured, passed)
+    return table
