@@ -32,7 +32,9 @@ class Runs:
 
     def __call__(self, seeds: range) -> FuzzReport:
         self.asked.append(seeds)
-        bad = {self.failing: "it broke"} if self.failing in seeds else {}
+        bad: dict[int, str] = {}
+        if self.failing is not None and self.failing in seeds:
+            bad[self.failing] = "it broke"
         return FuzzReport(finite=len(seeds) - 1 - len(bad), refused=1, failures=bad)
 
 

@@ -58,8 +58,8 @@ def run_frozen(
         AssertionError: If the pictures differ, or a gradient is not finite.
     """
     camera = Camera(tensors["viewmat"], tensors["K"], width, height)
-    geometry = [tensors[name] for name in ("means", "quats", "scales", "weight0")]
-    view = FrozenView(*geometry, camera, config)
+    means, quats, scales = tensors["means"], tensors["quats"], tensors["scales"]
+    view = FrozenView(means, quats, scales, tensors["weight0"], camera, config)
     values = tensors["values0"].clone().requires_grad_()
     image = view.render(values)
     # Sums of up to 200 terms in another order.
