@@ -28,7 +28,7 @@ from vlgs.fusion.mlp import MLP
 from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
-from vlgs.indicator import ColourOpacity, Learned
+from vlgs.indicator import ColourOpacity, Learned, PerLevel
 from vlgs.losses import (
     Losses,
     _filter,  # pyright: ignore[reportPrivateUsage]
@@ -66,9 +66,13 @@ NO_GRADIENT = {
     "vlgs.gaussians.ply.parse_ply": "from a file",
     "vlgs.gaussians.parameters.complete": "fills a file's gaps",
     "vlgs.gaussians.parameters.with_language_shape": "placed once",
+    "vlgs.gaussians.parameters.with_level_indicators": "placed once",
     "vlgs.gaussians.sound.broken_rows": "a mask",
     "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
     "vlgs.render.frustum.may_see": "a mask",
+    "vlgs.render.level.LevelModel.fuse": "for questions: a level of what SplatModel.fuse gives",
+    "vlgs.render.level.LevelModel.render": "SplatModel.render",
+    "vlgs.render.level.LevelModel.render_values": "SplatModel.render_values",
     "vlgs.render.cpu.freeze": "the constants of a FrozenView",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
@@ -283,6 +287,9 @@ CHECKS: dict[str, Callable[[], Check]] = {
     ),
     "vlgs.indicator.Learned.__call__": lambda: (
         lambda *v: Learned()(activated(*v)), list(parameters().values())
+    ),
+    "vlgs.indicator.PerLevel.__call__": lambda: (
+        lambda *v: PerLevel()(activated(*v)), list(parameters().values())
     ),
     "vlgs.indicator.ColourOpacity.__call__": lambda: (
         lambda *v: ColourOpacity()(activated(*v)), list(parameters().values())

@@ -32,8 +32,8 @@ class Learned:
 class PerLevel:
     """A learned indicator of its own for every mask level (``levels=joint``; systems.md D.8)."""
 
-    def __call__(self, gaussians: Gaussians) -> Float[Tensor, "n levels"]:
-        """Return `gaussians.indicators` itself."""
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
+        """Return `gaussians.indicators` itself: [n] where a model has no levels (the colour of ``sharing=none``)."""
         return gaussians.indicators
 
 

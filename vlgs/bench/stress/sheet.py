@@ -78,9 +78,10 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
     table = read_sheet(path)
     if list(table) != [field.name for field in fields(StressRow)]:  # of an older version
         return {}
+    times = table[["seconds", "cpu_seconds"]].astype(float)  # whole numbers come as int
     rows = [
         StressRow(**{str(key): value for key, value in row.items()})
-        for row in table.to_dict("records")
+        for row in table.assign(**times).to_dict("records")
     ]
     return {
         row.case: row
