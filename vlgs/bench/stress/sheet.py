@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -78,11 +79,12 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
     table = read_sheet(path)
     if list(table) != [field.name for field in fields(StressRow)]:  # of an older version
         return {}
-    times = table[["seconds", "cpu_seconds"]].astype(float)  # whole numbers come as int
-    rows = [
-        StressRow(**{str(key): value for key, value in row.items()})
-        for row in table.assign(**times).to_dict("records")
+    times = ("seconds", "cpu_seconds")  # whole ones come as int
+    records: list[dict[str, Any]] = [
+        {str(key): float(value) if key in times else value for key, value in record.items()}
+        for record in table.to_dict("records")
     ]
+    rows = [StressRow(**record) for record in records]
     return {
         row.case: row
         for row in rows
