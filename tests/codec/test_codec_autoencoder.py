@@ -246,3 +246,18 @@ def test_bad_training_settings(options: dict):
 def test_bad_widths(options: dict):
     with pytest.raises(ValueError, match="autoencoder: dim and one width"):
         Autoencoder(**options)
+
+
+def test_of_many_embeddings_a_part_is_measured(monkeypatch: pytest.MonkeyPatch):
+    vectors, areas, _ = masks(cone(6), 50, seed=7)
+    seen: list[int] = []
+    encode = Autoencoder.encode
+    monkeypatch.setattr("vlgs.codec.autoencoder.MEASURED", 64)
+    monkeypatch.setattr(
+        Autoencoder, "encode", lambda codec, rows: seen.append(len(rows)) or encode(codec, rows)
+    )
+    codec = quick()
+    codec.fit(vectors, areas)
+    assert max(seen) == 60  # every fifth of 300
+    every = (codec.decode(encode(codec, vectors)) * vectors).sum(dim=1)
+    assert codec.reconstruction == pytest.approx((areas @ every / areas.sum()).item(), abs=0.03)

@@ -121,6 +121,13 @@ def test_a_blended_view_of_no_weight_adds_nothing(tiny_scene: Scene):
     assert rendering.skips.done("blended render") == 1
 
 
+def test_a_view_is_not_blended_with_itself(tiny_scene: Scene):
+    module = module_of(replace(tiny_scene, train=tiny_scene.train[:1]))
+    first_step(module)
+    assert module.skips.done("blended render") == 0
+    assert module.skips.skipped == {}  # no skip, but no pair
+
+
 def test_skipping_a_light_blended_view_changes_the_loss_by_its_bound(tiny_scene: Scene):
     limit = 1.3  # above lambda: every view is light
     skipping = module_of(tiny_scene, f"trainer.skip.blend_weight={limit}")

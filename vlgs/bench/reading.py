@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from vlgs.module.lightning import VLGSModule
 
 DISTINCT = 10
-"""Photographs and language maps that differ; the others are further names of them, and are read and hashed like any other."""
+"""Photographs and maps of masks that differ; the others are further names of them, and are read and hashed like any other.
+The masks' vectors all differ: equal ones would make the codec's work less than it is."""
 MASKS = (30, 120, 80, 40)
 """Masks of a photograph at the four levels."""
 POINTS = 50_000
@@ -42,7 +43,7 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
     """Write scenes to a scratch folder, train on them for a moment in processes of their own, and write reading.csv."""
     from vlgs.bench.sheet import provenance, show, write_sheet
 
-    notes = f"files are in the page cache; photographs and language maps repeat after {DISTINCT}"
+    notes = f"files are in the page cache; photographs and maps of masks repeat after {DISTINCT}"
     header = provenance(seed, note=notes)
     rows: list[Reached] = []
     with tempfile.TemporaryDirectory(prefix="vlgs-reading-") as scratch:
@@ -155,11 +156,6 @@ def _write_masks(
 
     folder.mkdir()
     for i, name in enumerate(names):
-        if i >= DISTINCT:
-            for kind in "sf":
-                other = names[i % DISTINCT]
-                os.link(folder / f"{other}_{kind}.npy", folder / f"{name}_{kind}.npy")
-            continue
         levels, first = [], 0
         for count in MASKS:
             cells = rng.integers(-1, count, (12, 16)).astype(np.int32)
@@ -168,4 +164,8 @@ def _write_masks(
             first += count
         vectors = rng.normal(size=(first, 512))
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-        write_mask_files(folder, name, np.stack(levels), vectors)
+        if i < DISTINCT:
+            write_mask_files(folder, name, np.stack(levels), vectors)
+            continue
+        os.link(folder / f"{names[i % DISTINCT]}_s.npy", folder / f"{name}_s.npy")
+        np.save(folder / f"{name}_f.npy", vectors.astype(np.float32))

@@ -143,7 +143,7 @@ class VLGSModule(L.LightningModule):
         self._set_schedule(step)
         pair = self.sampler.pair(step)
         first, second = targets = self.target(pair[0]), self.target(pair[1])
-        plan = None if second is first else self._plan_blend(step, first, second)
+        plan = None if pair[0] == pair[1] else self._plan_blend(step, first, second)
         fused = self._fuse(targets, plan)
         renders = [self._render(i, t, fused) for i, t in zip(pair, targets, strict=True)]
         color_losses = [self._color_loss(r, t) for r, t in zip(renders, targets, strict=True)]

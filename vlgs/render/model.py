@@ -174,8 +174,6 @@ class SplatModel(nn.Module):
         """RGB of every Gaussian as a camera sees it, >= 0."""
         if self.evaluated:
             return self._fuse_as_seen(fused.gaussians, camera)[0]
-        if self.sh_degree == 0:  # the same from everywhere
-            return fused.color.clamp_min(0.0)
         gaussians, eye = fused.gaussians, camera_center(camera.viewmat)
         return view_color(fused.color, gaussians.shN, gaussians.means, eye, self.sh_degree)
 
