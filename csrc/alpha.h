@@ -93,12 +93,23 @@ inline void lanes_to_pixels(const T *lanes, T *pixels) {
       std::memcpy(pixels + 8, &c, sizeof c);
 }
 
+// Asks for the values of a Gaussian that a tile is about to need, unless they are so many that those asked
+// for first would be gone when their turn comes.
+template <class T>
+[[gnu::always_inline]] inline void ask_for_values(const Pass<T> &p, int64_t row) {
+  constexpr int64_t kMost = 256 / sizeof(T);
+  for (int i = 0; i < p.num_parts; ++i)
+    if (const int64_t channels = p.parts[i].channels; channels <= kMost)
+      ask_for(p.parts[i].values + row * channels, channels);
+}
+
 // Copies the records of a tile's list next to each other.
 template <class T>
 inline void gather_records(const Pass<T> &p, int64_t begin, int64_t end, T *to) {
   for (int64_t k = begin; k < end; ++k, to += kRecord) {
     if (k + kGatherAhead < end) __builtin_prefetch(p.records + int64_t(p.ranks[k + kGatherAhead]) * kRecord);
     store(to, load(p.records + int64_t(p.ranks[k]) * kRecord));
+    if (!p.narrow) ask_for_values(p, row_of(to));
     to[kPlace] = T(k - begin);
   }
 }

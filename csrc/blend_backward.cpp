@@ -204,9 +204,14 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
 
 template <class T, int kChains, Need kNeed, bool kClamp>
 inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
+  // The first channels are summed together with the moments, which leave that much room.
+  constexpr int kLead = kNeed == Need::kValuesOnly ? 0 : 4;
   const Pass<T> &p = *tile.pass;
-  const int64_t id = p.ids[p.ranks[tile.begin + int64_t(g[kPlace])]];
+  const int64_t row = row_of(g);
+  const Part<T> &front = p.parts[0];
   Sums<T, kChains> sums{};
+  Pack<T> lead[kLead + 1];
+  for (auto &l : lead) l = splat(T(0));
   for (uint32_t rest = blocks; rest; rest &= rest - 1) {
     const int64_t b = __builtin_ctz(rest);
     const T *upstream = tile.upstream + b * tile.upstream_stride;
@@ -217,7 +222,7 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
         const Part<T> &part = p.parts[i];
         if (part.d_image)
           toward[part.chain] =
-              project_values(part.values + id * part.channels, upstream, part.channels, toward[part.chain]);
+              project_values(part.values + row * part.channels, upstream, part.channels, toward[part.chain]);
         upstream += part.padded * kLanes;
       }
     }
@@ -225,15 +230,20 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
     step<T, kChains, kNeed, kClamp>(tile, g, state, toward, sums, weights);
     for (int c = 0; c < kChains; ++c)
       store(state + (kChainState + c * kChainStates + kAlphaT) * kLanes, weights[c]);
+    upstream = tile.upstream + b * tile.upstream_stride;
+    for (int k = 0; k < kLead; ++k) lead[k] = fma(weights[front.chain], load(upstream + k * kLanes), lead[k]);
   }
   if constexpr (kNeed != Need::kValuesOnly) {
     Pack<T> all[kLanes];
     for (auto &a : all) a = splat(T(0));
     for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
     for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
+    for (int k = 0; k < kLead; ++k) all[kSlotHead + k] = lead[k];
     T head[kLanes];
     sum_lanes(all, head);
     for (int i = 0; i < kSlotHead; ++i) slot[i] = head[i];
+    if (front.value_grad)
+      for (int k = 0; k < kLead; ++k) slot[front.slot + k] = head[kSlotHead + k];
   } else {
     for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
   }
@@ -242,7 +252,7 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
   for (int i = 0; i < p.num_parts; ++i) {
     const Part<T> &part = p.parts[i];
     T *to = slot + part.slot;
-    int64_t k = 0;
+    int64_t k = i == 0 ? kLead : 0;
     if (part.value_grad) {
       for (; k + 16 <= part.padded; k += 16)
         value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);

@@ -95,16 +95,25 @@ inline void add_channels(const Tile<T> &tile, const Part<T> &part, int64_t chann
   Pack<T> acc[kWidth];
   for (int k = 0; k < kWidth; ++k) acc[k] = load(sums + k * kLanes);
   for (int64_t j = 0; j < count; ++j) {
-    const uint32_t rank = tile.pass->ranks[tile.begin + tile.list[first + j]];
-    const T *values = part.values + int64_t(tile.pass->ids[rank]) * part.channels + channel;
+    const T *g = tile.records + int64_t(tile.list[first + j]) * kRecord;
+    const T *values = part.values + row_of(g) * part.channels + channel;
     const Pack<T> weight = load(tile.weights + (part.chain * kWeightsAhead + j) * kLanes);
     for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, splat(values[k]), acc[k]);
   }
   for (int k = 0; k < kWidth; ++k) store(sums + k * kLanes, acc[k]);
 }
 
-// Any number of channels: weights of a stretch of the list first, then the channels by eight, four, two and
-// one.
+// As many sums as fit into registers beside what they are made of.
+#if defined(__AVX512F__)
+template <class T>
+constexpr int kChunk = sizeof(T) == 4 ? 16 : 8;
+#else
+template <class T>
+constexpr int kChunk = 8;
+#endif
+
+// Any number of channels: weights of a stretch of the list first, then the channels by chunks, and what is
+// left by eight, four, two and one.
 template <class T, int kChains, bool kBefore>
 inline void sum_wide(const Tile<T> &tile, const Centres<T> &at, int64_t reach, Rays<T, kChains> &rays) {
   const Pass<T> &p = *tile.pass;
@@ -125,8 +134,10 @@ inline void sum_wide(const Tile<T> &tile, const Centres<T> &at, int64_t reach, R
     for (int i = 0; i < p.num_parts; ++i) {
       const Part<T> &part = p.parts[i];
       int64_t k = 0;
-      for (; k + 8 <= part.channels; k += 8, sums += 8 * kLanes)
-        add_channels<T, 8>(tile, part, k, first, count, sums);
+      for (; k + kChunk<T> <= part.channels; k += kChunk<T>, sums += kChunk<T> * kLanes)
+        add_channels<T, kChunk<T>>(tile, part, k, first, count, sums);
+      if (kChunk<T> > 8 && part.channels & 8)
+        add_channels<T, 8>(tile, part, k, first, count, sums), k += 8, sums += 8 * kLanes;
       if (part.channels & 4)
         add_channels<T, 4>(tile, part, k, first, count, sums), k += 4, sums += 4 * kLanes;
       if (part.channels & 2)

@@ -7,6 +7,7 @@
 #pragma once
 
 #include <cstdint>
+#include <cstring>
 
 #include "attention.h"
 #include "squared_error.h"
@@ -81,6 +82,27 @@ enum Record {
   kPlace = kRecord - 1  // in the list of the tile at hand
 };
 constexpr int kWeight = 0, kCutoff = 1;  // record[kChains0 + 2 chain + ...]
+// Wide values stay where they are: the record has the bits of the Gaussian's row in place of them. These are
+// always inline, so that no instruction set gets another one's copy.
+template <class T>
+[[gnu::always_inline]] inline void set_row(T *record, uint32_t row) {
+  std::memcpy(record + kValues, &row, sizeof row);
+}
+template <class T>
+[[gnu::always_inline]] inline int64_t row_of(const T *record) {
+  uint32_t row;
+  std::memcpy(&row, record + kValues, sizeof row);
+  return row;
+}
+
+// Asks for the cache lines of `count` numbers. GCC drops calls of a function that does nothing else, unless
+// it is inlined.
+template <class T>
+[[gnu::always_inline]] inline void ask_for(const T *from, int64_t count) {
+  constexpr int64_t kLine = 64 / sizeof(T);
+  for (int64_t k = 0; k < count; k += kLine) __builtin_prefetch(from + k);
+  __builtin_prefetch(from + count - 1);
+}
 
 // One group of channels; several may hang on one chain.
 template <class T>

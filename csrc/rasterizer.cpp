@@ -33,7 +33,7 @@ void add_slots(const Pass<T> &p, int64_t tile, Range ranks, const T *slots, T *s
   const uint32_t *at = std::lower_bound(list, end, ranks.begin);
   const int64_t size = summed(p);
   for (; at < end && *at < ranks.end; ++at) {
-    if (at + kAhead < end) __builtin_prefetch(sums + at[kAhead] * size, 1);
+    if (at + kAhead < end) ask_for(sums + at[kAhead] * size, size);
     T *sum = sums + *at * size;
     const T *slot = slots + (at - list) * p.slot_size;
     for (int64_t i = 0; i < size; ++i) sum[i] += slot[i];
@@ -158,6 +158,7 @@ void Blend<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) cons
       g[kChains0 + 2 * c + kWeight] = chains_[s.first_chain + c].weight[i];
       g[kChains0 + 2 * c + kCutoff] = order_.cutoffs[(s.first_chain + c) * n_ + i];
     }
+    if (!p.narrow) set_row(g, uint32_t(i));
     for (int k = 0; k < p.num_parts; ++k) {
       const Part<T> &part = s.parts[k];
       const T *values = part.values + i * part.channels;
@@ -260,7 +261,7 @@ void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T>
     static constexpr T kNothing[kRecord] = {};
     const bool seen = order_.rank_of[i] != kCulled;
     if (const uint32_t next = order_.rank_of[std::min(i + kAhead, n_ - 1)]; next != kCulled) {
-      __builtin_prefetch(sums.data() + next * size);
+      ask_for(sums.data() + next * size, size);
       __builtin_prefetch(p.records + next * int64_t(kRecord));
     }
     const T *sum = seen ? sums.data() + order_.rank_of[i] * size : kNothing;
