@@ -75,7 +75,7 @@ SKIPS: tuple[Skip, ...] = (
     ),
     Skip(
         "early_stop", "raster.transmittance_min", 1e-4, 0.0, "on", "bounded",
-        "stop=after: transmittance_min * max |value|; stop=before: that / (1 - alpha_max)",
+        "stop=after: transmittance_min * largest value; stop=before: that / (1 - alpha_max)",
         "What lies behind a pixel's transmittance_min is not blended; per group, and a block ends when all its groups have.",
         "3DGS; the bound: pitfall of stopping before",
     ),

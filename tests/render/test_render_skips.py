@@ -81,7 +81,7 @@ def lost(splats: Splats, config: RasterConfig) -> float:
 @pytest.mark.parametrize("stop", ["after", "before"])
 @pytest.mark.parametrize("weight", [0.3, 0.9, 0.99, 1.0])
 def test_an_early_stop_stays_within_its_bound(threshold: float, stop: str, weight: float):
-    assert "transmittance_min * max |value|" in named("early_stop").bound
+    assert "transmittance_min * largest value" in named("early_stop").bound
     config = RasterConfig(transmittance_min=threshold, stop=stop)  # pyright: ignore[reportArgumentType]
     bound = threshold if stop == "after" else threshold / (1 - config.alpha_max)
     bound = min(bound, 1.0)
