@@ -236,6 +236,34 @@ def test_runs_that_must_not_stand_together_are_refused(table: Table, tmp_path: P
         read_metrics(tmp_path)
 
 
+FAULTS = """
+label: faults
+caption: Faults
+dataset: synthetic
+metrics: [miou]
+rows: [{label: Full, set: [data.faults.missed=0]}]
+"""
+
+
+def test_a_table_is_written_where_its_options_exist(table: Table, tmp_path: Path):
+    path = tmp_path / "faults.yaml"
+    path.write_text(FAULTS)
+    procedural_only = load_table(path)
+    photographs = Benchmark("photographs", ("data=colmap", "data.root=x"), ("x",), (0,))
+    for benchmark in (BENCHMARK, photographs):
+        benchmark.extend(tmp_path / benchmark.name / "benchmark.yaml")
+    fake_runs(tmp_path, [table, procedural_only], BENCHMARK, value)
+    fake_runs(tmp_path, [table], photographs, value)
+    write_all(tmp_path, [table, procedural_only])
+    assert (tmp_path / "synthetic" / "faults.csv").is_file()
+    assert (tmp_path / "photographs" / "tiny.csv").is_file()
+    assert not (tmp_path / "photographs" / "faults.csv").exists()
+
+    path.write_text(FAULTS.replace("missed", "mist"))
+    with pytest.raises(ValueError, match=r"data\.faults\.mist"):  # in no benchmark: a slip
+        write_all(tmp_path, [load_table(path)])
+
+
 def test_the_report_has_its_pictures(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     filled = filled_of(table, tmp_path)

@@ -22,6 +22,10 @@ from vlgs.config import (
 from vlgs.files import write_atomically
 
 
+class UnknownOptionError(ValueError):
+    """A row has an option that the configuration of a benchmark does not have."""
+
+
 @dataclass(frozen=True)
 class Benchmark:
     """On what the rows of a table are run: `results/<name>/benchmark.yaml`, committed with the tables."""
@@ -113,7 +117,7 @@ class Composer:
         """Recipe of a row on this benchmark.
 
         Raises:
-            ValueError: If an override is not one of the configuration's.
+            UnknownOptionError: If an override is not one of the configuration's.
         """
         words = [*self.benchmark.overrides, *overrides]
         key = hashlib.sha256("\0".join([self._tree, *words]).encode()).hexdigest()
@@ -165,7 +169,7 @@ def _compose(overrides: list[str]) -> DictConfig:
         check_targets(config)
     except (ConfigCompositionException, OmegaConfBaseException, HydraException) as error:
         reason = str(error).strip().partition("\n")[0]
-        raise ValueError(f"{' '.join(overrides) or 'the defaults'}: {reason}") from error
+        raise UnknownOptionError(f"{' '.join(overrides) or 'the defaults'}: {reason}") from error
     return config
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vlgs.files import write_atomically
-from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import read_metrics, require_one_meaning, tidy, write_frame
 from vlgs.tables.latex import document, to_latex
@@ -19,7 +19,8 @@ def write_all(
 
     Args:
         results: Folder of the runs and of the benchmarks.
-        tables: Which to write; one without a single run is left out.
+        tables: Which to write. One without a single run is left out, and so is one with options that the data of a benchmark do not
+            have (faults of the supervision, on photographs).
         name: Only the tables of this benchmark.
         html: Write index.html with its plots too, of these tables.
 
@@ -27,7 +28,8 @@ def write_all(
         The folders that were written.
 
     Raises:
-        ValueError: If there is no benchmark, or runs that must not stand in one table.
+        ValueError: If there is no benchmark, or runs that must not stand in one table, or a table has an option that no benchmark
+            has.
     """
     files = sorted(results.glob(f"{name or '*'}/benchmark.yaml"))
     if not files:
@@ -38,10 +40,18 @@ def write_all(
     frame = tidy(read_metrics(results))
     require_one_meaning(frame)
     write_frame(frame, results)
+    refused: dict[str, UnknownOptionError] = {}
+    fitting: set[str] = set()
     for file in files:
         benchmark = Benchmark.read(file)
         composer = Composer(benchmark, results / "cache" / "recipes.json")
-        filled = [fill(table, benchmark, composer, frame) for table in tables]
+        filled: list[Filled] = []
+        for table in tables:
+            try:
+                filled.append(fill(table, benchmark, composer, frame))
+                fitting.add(table.label)
+            except UnknownOptionError as error:
+                refused[table.label] = error
         composer.save()
         filled = [table for table in filled if len(table.runs)]
         write_tables(file.parent, filled)
@@ -51,6 +61,8 @@ def write_all(
             )
 
             write_report(file.parent, filled, frame, results)
+    for label in refused.keys() - fitting:
+        raise refused[label]
     return [file.parent for file in files]
 
 
