@@ -44,7 +44,8 @@ def error(parser: ArgumentParser) -> Runner:
 
     def run(args: Namespace) -> int:
         from vlgs.bench.error import make_scenes, run_error
-        from vlgs.bench.presets import load_run, train_or_load
+        from vlgs.bench.presets import load_run, train_a_little, train_or_load
+        from vlgs.bench.train import QUICK
 
         sizes = [(400, 64, 48)] if args.quick else [(50_000, 320, 240), (200_000, 640, 480)]
         trained = None
@@ -52,9 +53,12 @@ def error(parser: ArgumentParser) -> Runner:
             trained = load_run(args.run)
         elif not args.no_trained and not args.quick:
             trained = train_or_load([f"seed={args.seed}"], Path("results"))
+        stepping = trained
+        if args.quick and not args.no_trained and trained is None:
+            stepping = train_a_little([*QUICK, "codec.cache_dir=null", f"seed={args.seed}"])
         scenes = make_scenes(sizes, trained, args.seed)
         repeats = 3 if args.quick else args.repeats
-        broken = run_error(scenes, trained, args.threads, repeats, args.out, args.seed)
+        broken = run_error(scenes, trained, args.threads, repeats, args.out, args.seed, stepping)
         for check in broken:
             print(
                 f"error: {check.scene}: {check.promise} must be at most {check.bound:.2e}, got {check.measured:.2e}",
