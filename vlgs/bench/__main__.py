@@ -100,6 +100,11 @@ def train(parser: ArgumentParser) -> Runner:
     parser.add_argument("--recipes", nargs="+", help="labels of vlgs/bench/train.py; default: all")
     parser.add_argument("--root", type=Path, help="a scene of photographs (data=colmap data.root=)")
     parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
+    parser.add_argument(
+        "--override", nargs="+", default=[], metavar="KEY=VALUE",
+        help="of the photographs, e.g. data.features=FOLDER query=vocab_softmax",
+    )  # fmt: skip
+    parser.add_argument("--no-synthetic", action="store_true", help="the photographs alone")
     parser.add_argument("--points", type=int, default=8, help="evaluations per curve")
     parser.add_argument("--train-threads", type=int, default=2)
     parser.add_argument("--psnr", type=float, help="target in dB; default: that of default - 1")
@@ -112,7 +117,9 @@ def train(parser: ArgumentParser) -> Runner:
         unknown = sorted(set(labels) - set(RECIPES))
         if unknown:
             raise ValueError(f"bench: recipe must be one of {', '.join(RECIPES)}, got {unknown[0]}")
-        scenes = scene_overrides(args.root, args.resize, args.quick)
+        scenes = scene_overrides(
+            args.root, args.resize, args.quick, not args.no_synthetic, args.override
+        )
         points = 2 if args.quick else args.points
         targets = (args.psnr, args.miou)
         run_train(scenes, labels, args.out, points, args.train_threads, args.seed, targets)
