@@ -211,7 +211,7 @@ def stress(parser: ArgumentParser) -> Runner:
         from rich.console import Console
 
         from vlgs.bench.stress import CASES
-        from vlgs.bench.stress.sheet import run_cases, show_table
+        from vlgs.bench.stress.sheet import FAILED, run_cases, show_table
 
         cases = [c for c in CASES if not args.only or any(part in c.name for part in args.only)]
         if not cases:
@@ -220,7 +220,7 @@ def stress(parser: ArgumentParser) -> Runner:
         rows = run_cases(cases, not args.quick, path)
         console = Console()
         console.print(show_table(rows), width=max(console.width, 140))
-        return int(any(not row.passed for row in rows))
+        return int(any(row.outcome == FAILED for row in rows))
 
     return run
 
