@@ -10,9 +10,10 @@ import torch
 
 from vlgs.bench import error, steps
 from vlgs.bench.checks import Check, violated
+from vlgs.bench.one_step import StepSwitch, measure_step, run_step, step_switches, turned
 from vlgs.bench.presets import Trained, train_a_little
 from vlgs.bench.sheet import read_sheet
-from vlgs.bench.steps import measure_step, measure_switches, run_step, step_switches, turned
+from vlgs.bench.steps import measure_switches
 from vlgs.bench.train import QUICK
 from vlgs.bench.workload import make_workload
 from vlgs.blend import blend_camera
@@ -54,8 +55,9 @@ def test_every_switch_of_training_has_a_row_and_keeps_its_promise(trained: Train
     assert reuse.skipped == pytest.approx(0.42, abs=0.2)
     assert by_name["blend_zero"].skipped == 0
     assert frozen.skipped == 1
-    assert frozen.l2["splats.means"] is None
-    assert frozen.l2["splats.features"] is not None
+    assert frozen.kept_mib is not None
+    assert frozen.kept_mib > 0
+    assert [name for name, l2 in frozen.l2.items() if l2 is not None] == ["splats.features"]
     assert by_name["finite_check"].skipped is None
     share = by_name["fuse_visible"].skipped
     assert share is not None
@@ -83,12 +85,12 @@ def test_bounds_are_tight_enough_to_be_broken(trained: Trained, monkeypatch: pyt
         "blend_small": {"blend_weight": 2.0},
         "blend_reuse": {"blend_reuse": 0.1},
     }
-    right = steps.StepSwitch.setting
+    right = StepSwitch.setting
 
-    def setting(self: steps.StepSwitch, on: bool) -> dict[str, Any]:
+    def setting(self: StepSwitch, on: bool) -> dict[str, Any]:
         return wrong.get(self.skip.name, right(self, on)) if on else right(self, on)
 
-    monkeypatch.setattr(steps.StepSwitch, "setting", setting)
+    monkeypatch.setattr(StepSwitch, "setting", setting)
     broken = violated(measure_switches("q", trained.module, 1, 1, draws=60)[1])
     assert [c.promise.partition(":")[0] for c in broken] == ["blend_small", "blend_reuse"]
 

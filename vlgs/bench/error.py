@@ -235,7 +235,7 @@ def _print(rows: Sequence[ErrorRow]) -> None:
 def _print_steps(rows: Sequence[StepRow]) -> None:
     lines = []
     for r in rows:
-        gradient = max(v for v in r.l2.values() if v is not None)
+        gradient = max((v for v in r.l2.values() if v is not None), default=0.0)
         cpu = [f"{a.cpu + b.cpu:.1f}" for a, b in ((r.on_forward, r.on_backward), (r.off_forward, r.off_backward))]  # fmt: skip
         times = [f"{t.ms:.1f}" for t in (r.on_forward, r.off_forward, r.on_backward, r.off_backward)]  # fmt: skip
         bound = "" if r.loss_bound is None else f"{r.loss_bound:.1e}"

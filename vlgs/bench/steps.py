@@ -4,47 +4,26 @@ Both steps start from one state of one module, look at the same views and end be
 again. Where a switch decides step by step, those steps are timed in which it takes effect, and of them the worst.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from copy import deepcopy
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from time import perf_counter, process_time
-from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import torch
-from torch import Tensor
 
 from vlgs.bench.checks import EXACT, Check
-from vlgs.bench.clock import Pass, Spread, spreads, take_turns
-from vlgs.bench.outcome import Errors, Outcome, compare
+from vlgs.bench.clock import Spread, spreads, take_turns
+from vlgs.bench.memory import MIB
+from vlgs.bench.one_step import Step, StepSwitch, measure_step, run_steps, step_switches, turned
+from vlgs.bench.outcome import Errors, compare
 from vlgs.geometry import camera_center
 from vlgs.module.blended import BlendPlan
 from vlgs.module.lightning import VLGSModule
-from vlgs.module.settings import SkipConfig
-from vlgs.module.state import capture, restore
-from vlgs.skips import SKIPS, Skip
 from vlgs.types import Camera
 
 STEPS = 4
 """Steps that are timed and compared, in turn; times are per step."""
 DRAWS = 400
 """Iterations looked at for how often a blended view is left out."""
-FROZEN = ("means", "quats", "log_scales", "opacity_logits", "indicator_logits")
-"""What is frozen on both sides of ``frozen_weights``."""
-
-
-@dataclass(frozen=True)
-class StepSwitch:
-    """A skip whose setting is a field of `SkipConfig`."""
-
-    skip: Skip
-    field: str
-
-    def setting(self, on: bool) -> dict[str, Any]:
-        """The field and its value."""
-        return {self.field: self.skip.on if on else self.skip.off}
 
 
 @dataclass(frozen=True)
@@ -66,6 +45,8 @@ class StepRow:
     off_forward: Spread
     off_backward: Spread
     repeats: int
+    kept_mib: float | None
+    """What is kept in memory instead, MiB; None where nothing is."""
     skipped: float | None
     """Share of the work that is left out, or of the blended views of `DRAWS` iterations; None where nothing counts it."""
     loss: float
@@ -80,93 +61,6 @@ class StepRow:
     l2: Mapping[str, float | None]
     """|g - g_off| / |g_off| per parameter, the worst of the steps; None where it has no gradient."""
     cos: Mapping[str, float | None]
-
-
-class Step(NamedTuple):
-    """What a step came to."""
-
-    loss: float
-    outcome: Outcome
-    """Images of the real views, gradients of all parameters."""
-    blended: float | None
-    """Mean squared error of the blended view; None where none was rendered or the view does not count."""
-
-
-def step_switches() -> list[StepSwitch]:
-    """In the order of `SKIPS`."""
-    names = {field.name for field in fields(SkipConfig)}
-    switches = []
-    for skip in SKIPS:
-        group, _, field = skip.setting.rpartition(".")
-        if group == "trainer.skip" and field in names:
-            switches.append(StepSwitch(skip, field))
-    return switches
-
-
-def turned(module: VLGSModule, switch: StepSwitch, on: bool) -> VLGSModule:
-    """A module of its own in the same state, with the switch turned.
-
-    For ``frozen_weights`` what it needs is frozen on both sides.
-    """
-    freeze, config = module.settings.freeze, module.gaussians_config
-    if switch.field == "frozen_weights":
-        own = [name for name in module.model.splats if name.startswith("language_")]
-        freeze = [*FROZEN, *own]
-        config = replace(config, densify=replace(config.densify, stop=0))
-    skip = replace(module.settings.skip, **switch.setting(on))
-    settings = replace(module.settings, freeze=freeze, skip=skip)
-    made = VLGSModule(
-        deepcopy(module.model), module.scene, module.blend, module.losses, config, settings,
-        module.seed, module.color,
-    )  # fmt: skip
-    restore(made, capture(module, {}))
-    made.skips.restore({})
-    made.skips.similarities = module.skips.similarities  # constants of the scene
-    return made
-
-
-def run_step(module: VLGSModule, step: int) -> Pass:
-    """One training step up to Adam, which does not follow: time forward, and backward until Adam would begin."""
-    marks: list[tuple[float, float]] = []
-
-    def mark() -> None:
-        marks.append((perf_counter(), process_time()))
-
-    def backward(*args: Any) -> Any:
-        mark()
-        return right(*args)
-
-    right, next_step = module._backward, module.next_step
-    with ExitStack() as patches:
-        patches.enter_context(patch.object(module, "_backward", backward))
-        patches.enter_context(patch.object(module.optimizer, "step", mark))
-        mark()
-        module.training_step(step, 0)
-    module.next_step = next_step
-    start, middle, end = marks
-    ways = ((start, middle), (middle, end))
-    return Pass(*(1e3 * (b - a) for way in ways for a, b in zip(*way, strict=True)))
-
-
-def measure_step(module: VLGSModule, step: int) -> Step:
-    """What the step comes to; its numbers are copies."""
-    blended: list[float] = []
-    right = module._blended_loss
-
-    def watched(plan: BlendPlan, *args: Any) -> Tensor:
-        loss = right(plan, *args)
-        if plan.weight > 0:
-            blended.append(loss.item() / plan.weight)
-        return loss
-
-    with patch.object(module, "_blended_loss", watched):
-        run_step(module, step)
-    images = [i for r in module.report.renders for i in (r.color, r.feature) if i is not None]
-    gradients = {
-        name: p.grad.double() for name, p in module.model.named_parameters() if p.grad is not None
-    }
-    outcome = Outcome(tuple(image.detach().double() for image in images), gradients)
-    return Step(module.report.loss, outcome, blended[0] if blended else None)
 
 
 def measure_switches(
@@ -184,20 +78,15 @@ def measure_switches(
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        pairs = {s: _Pair(module, s, draws) for s in step_switches()}
-        timed: dict[tuple[StepSwitch, bool], Callable[[], Pass]] = {
-            (switch, on): partial(_time_steps, pair.module(on), pair.steps)
-            for switch, pair in pairs.items()
-            for on in (True, False)
-        }
-        samples = take_turns(timed, repeats, warm_up=0)
         rows: list[StepRow] = []
         checks: list[Check] = []
-        for switch, pair in pairs.items():
-            times = (*spreads(samples[switch, True]), *spreads(samples[switch, False]))
-            row = pair.row(scene, threads, times, repeats)
-            rows.append(row)
-            checks.append(pair.check(row))
+        for switch in step_switches():
+            pair = _Pair(module, switch, draws)
+            sides = {on: partial(run_steps, pair.module(on), pair.steps) for on in (True, False)}
+            samples = take_turns(sides, repeats, warm_up=0)
+            times = (*spreads(samples[True]), *spreads(samples[False]))
+            rows.append(pair.row(scene, threads, times, repeats))
+            checks.append(pair.check(rows[-1]))
         return rows, checks
     finally:
         torch.set_num_threads(before)
@@ -226,7 +115,7 @@ class _Pair:
         if switch.field.startswith("blend"):
             self._look_for_effect(range(first, first + draws))
         for side in (self.on, self.off):  # what is kept from here on need not be made any more
-            _time_steps(side, self.steps)
+            run_steps(side, self.steps)
             side.skips.restore({})
 
     def module(self, on: bool) -> VLGSModule:
@@ -249,7 +138,7 @@ class _Pair:
         names = [name for name, _ in self.off.model.named_parameters()]
         return StepRow(
             scene, self.off.model.count, skip.name, skip.kind, skip.default, threads, len(sides),
-            *times, repeats, self.skipped, sides[worst][1].loss, moved[worst], bounds[worst],
+            *times, repeats, self._kept_mib(), self.skipped, sides[worst][1].loss, moved[worst], bounds[worst],
             max(e.image_max for e in errors), max(e.image_mean for e in errors),
             {name: _worst(errors, "l2", name) for name in names},
             {name: _worst(errors, "cos", name) for name in names},
@@ -261,7 +150,7 @@ class _Pair:
         promise = f"{skip.name}: on against off"
         if skip.kind == "exact":
             moved = [v for v in row.l2.values() if v is not None]
-            worst = max(row.loss_error / abs(row.loss), row.image_max, *moved)
+            worst = max(row.loss_error / (abs(row.loss) or 1.0), row.image_max, *moved)
             return Check(scene, promise, worst, EXACT)
         if row.loss_bound is not None:
             # float32 rounds the sums of on and off apart.
@@ -270,6 +159,9 @@ class _Pair:
         assert isinstance(skip.on, float)
         # Cameras are float32.
         return Check(scene, f"{promise}, camera", self.detour, skip.on + 1e-5)
+
+    def _kept_mib(self) -> float | None:
+        return None if self.on.frozen is None else self.on.frozen.views.used / MIB
 
     def _bound(self, off: Step) -> float | None:
         """How far the loss may move."""
@@ -299,11 +191,6 @@ class _Pair:
             self.on.skips.similarities = self.off.skips.similarities = _Unlike()
             taken = dict.fromkeys(wanted, 0.0)
         self.steps = sorted(taken, key=lambda s: -taken[s])[:STEPS] or self.steps
-
-
-def _time_steps(module: VLGSModule, steps: Sequence[int]) -> Pass:
-    passes = [run_step(module, step) for step in steps]
-    return Pass(*(sum(times) / len(passes) for times in zip(*passes, strict=True)))
 
 
 def _plan(module: VLGSModule, step: int) -> BlendPlan | None:
