@@ -34,6 +34,7 @@ def test_every_switch_of_training_has_a_row_and_keeps_its_promise(trained: Train
     before = capture(trained.module, {})
     rows, checks = measure_switches("q", trained.module, 1, 1, draws=60)
     assert violated(checks) == []
+    assert [c.bound for c in checks if not c.bound] == [0.0, 0.0], "blend_zero and finite_check"
     after = capture(trained.module, {})
     assert after.step == before.step
     assert all(torch.equal(after.tensors[k], before.tensors[k]) for k in before.tensors)

@@ -71,7 +71,7 @@ def check_switch(scene: str, w: Workload, switch: RasterSwitch) -> list[Check]:
     errors = compare(outcome(w, on), outcome(w, off))
     promise = f"{switch.skip.name}: on against off"
     if switch.skip.kind == "exact":
-        return [check_exact(scene, promise, errors)]
+        return [check_exact(scene, promise, errors, switch.skip)]
     if switch.field == "transmittance_min":
         share = on.transmittance_min / (1 - on.alpha_max if on.stop == "before" else 1)
         # float32 rounds the sums of on and off alike, but not to the same bits.
