@@ -356,8 +356,10 @@ BlendWork Blend<T>::work() const {
   BlendWork work{lists_.begin.back(), 0};
   for (const Stage &s : stages_) {
     const Pass<T> &p = s.pass;
-    if (!p.transmittance || p.stop_before)
-      throw std::invalid_argument("rasterize: work must be counted with keep and stop=\"after\"");
+    if (p.stop_before)
+      throw std::invalid_argument("rasterize: stop must be after where work is counted, got before");
+    if (!p.transmittance)
+      throw std::invalid_argument("rasterize: keep must be true where work is counted, got false");
     for (int64_t tile = 0; tile < grid_.tiles_x * grid_.tiles_y; ++tile)
       for (int b = 0; b < kBlocks; ++b) {
         // Where every pixel is done in every chain a block ends behind its last contribution.

@@ -128,7 +128,7 @@ def test_skipped_blocks_are_those_of_the_masks():
     assert entries < by_masks.weighed < weighed
     boxes = switches._count(w, replace(off, tile_test=False))
     assert boxes.entries > entries
-    with pytest.raises(ValueError, match="work must be counted"):
+    with pytest.raises(ValueError, match="stop must be after where work is counted, got before"):
         switches._count(w, replace(off, stop="before"))
 
 

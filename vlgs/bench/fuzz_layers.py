@@ -145,14 +145,10 @@ def _squared_error(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
     eps, most = 1e3 * torch.finfo(dtype).eps, torch.finfo(dtype).max
     _agree("squared error", loss, gaps.square().sum() / number, gaps.square().sum() < most / 4, eps)
     d_gaps = 2 * scale.double() / number * gaps
-    _agree(
-        "gradient of a squared error",
-        d_render,
-        d_gaps,
-        gaps.abs().maximum(d_gaps.abs()) < most / 4,
-        eps,
-    )
-    _require(torch.equal(d_target.nan_to_num(7), (-d_render).nan_to_num(7)), "squared error: gradients must be opposite")  # fmt: skip
+    in_range = gaps.abs().maximum(d_gaps.abs()) < most / 4
+    _agree("gradient of a squared error", d_render, d_gaps, in_range, eps)
+    opposite = torch.equal(d_target.nan_to_num(7), (-d_render).nan_to_num(7))
+    _require(opposite, "squared error: gradients must be opposite")
 
 
 def _agree(name: str, got: Tensor, want: Tensor, in_range: Tensor, relative: float) -> None:

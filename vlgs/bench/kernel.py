@@ -193,19 +193,9 @@ def _measure(
         over = [None if known is None else total / known for known in (bound, target)]
         rows.append(
             KernelRow(
-                job,
-                isa,
-                forward,
-                backward,
-                len(passes),
-                peer,
-                ratio,
-                bound,
-                over[0],
-                target,
-                over[1],
+                job, isa, forward, backward, len(passes), peer, ratio, bound, over[0], target, over[1]
             )
-        )
+        )  # fmt: skip
     return rows
 
 
@@ -300,18 +290,9 @@ def _print(rows: Sequence[KernelRow]) -> None:
             )
         )  # fmt: skip
     columns = ("Gaussians", "image", "channels", "threads", "ISA", "part", "forward", "backward")
+    yardsticks = ("both", "CPU", "OpenSplat", "ratio", "bound", "over it", "target", "over target")
     show(
         "rasterizer, ms: median [quartiles] of wall clock; CPU sums over threads",
-        (
-            *columns,
-            "both",
-            "CPU",
-            "OpenSplat",
-            "ratio",
-            "bound",
-            "over it",
-            "target",
-            "over target",
-        ),
+        (*columns, *yardsticks),
         lines,
     )
