@@ -22,6 +22,7 @@ from vlgs.bench.scenes import (
 from vlgs.bench.sheet import read_sheet
 from vlgs.bench.switches import check_switch, raster_switches
 from vlgs.bench.workload import Workload, make_workload
+from vlgs.render import cpu
 from vlgs.types import RasterConfig
 
 
@@ -128,6 +129,11 @@ def test_skipped_blocks_are_those_of_the_masks():
     assert entries < by_masks.weighed < weighed
     boxes = switches._count(w, replace(off, tile_test=False))
     assert boxes.entries > entries
+    # More chains than one pass over the tiles carries.
+    splats = cpu.project(w.means, w.quats, w.scales, w.camera, off)
+    groups = [replace(w.groups[0], weight=w.groups[0].weight.clone()) for _ in range(5)]
+    n = cpu.count_work(splats, groups[:1], w.camera, off).entries
+    assert cpu.count_work(splats, groups, w.camera, off) == (n, 5 * 16 * n)
     with pytest.raises(ValueError, match="stop must be after where work is counted, got before"):
         switches._count(w, replace(off, stop="before"))
 
