@@ -150,7 +150,11 @@ void bind_blend(nb::module_ &m, const char *name) {
             self.backward(d, threads);
           },
           strict("values"), strict("d_images"), strict("d_alphas"), strict("d_mean2d").none(),
-          strict("d_ellipse").none(), strict("d_weights"), strict("d_values"), "threads"_a);
+          strict("d_ellipse").none(), strict("d_weights"), strict("d_values"), "threads"_a)
+      .def("work", [](const Blend<T> &self) {
+        const BlendWork work = self.work();
+        return std::pair(work.entries, work.weighed);
+      });
 }
 
 AttentionShape attention_shape(int64_t color, int64_t feature, int64_t heads, int64_t width, bool self) {

@@ -352,6 +352,35 @@ void Blend<T>::backward(const BlendGrads<T> &d, int threads) const {
   }
 }
 
+template <class T>
+BlendWork Blend<T>::work() const {
+  BlendWork work{lists_.begin.back(), 0};
+  for (const Stage &s : stages_) {
+    const Pass<T> &p = s.pass;
+    if (p.stop_before)
+      throw std::invalid_argument("rasterize: stop must be after where work is counted, got before");
+    if (!p.transmittance)
+      throw std::invalid_argument("rasterize: keep must be true where work is counted, got false");
+    for (int64_t tile = 0; tile < grid_.tiles_x * grid_.tiles_y; ++tile)
+      for (int b = 0; b < kBlocks; ++b) {
+        // Where every pixel is done in every chain a block ends behind its last contribution.
+        bool done = true;
+        T end = -1;
+        for (int c = 0; c < p.chains; ++c) {
+          const int64_t where = ((tile * p.chains + c) * kBlocks + b) * kPixels;
+          for (int64_t i = where; i < where + kPixels; ++i) {
+            done &= p.transmittance[i] <= p.transmittance_min;
+            end = std::max(end, p.last[i]);
+          }
+        }
+        const int64_t begin = p.tile_begin[tile], count = p.tile_begin[tile + 1] - begin;
+        const int64_t visited = done ? int64_t(end) + 1 : count;
+        for (int64_t k = begin; k < begin + visited; ++k) work.weighed += (p.masks[k] >> b & 1) * p.chains;
+      }
+  }
+  return work;
+}
+
 template class Blend<float>;
 template class Blend<double>;
 

@@ -40,6 +40,12 @@ struct BlendGrads {
   std::vector<T *> d_values;   // [n, channels] per part
 };
 
+// What a forward pass took, for benchmarks.
+struct BlendWork {
+  int64_t entries;  // of all tile lists
+  int64_t weighed;  // (Gaussian, 4x4 block, chain) triples that blending went through
+};
+
 // One picture: blends on construction and keeps the lists for its gradients.
 template <class T>
 class Blend {
@@ -49,6 +55,9 @@ class Blend {
         const BlendConfig &, bool keep, bool *visible, int threads);
 
   void backward(const BlendGrads<T> &, int threads) const;
+
+  // Counted afterwards, from the lists and what is kept for backward: needs `keep` and not `stop_before`.
+  BlendWork work() const;
 
   int64_t rows() const { return n_; }
   const Pass<T> &pass() const { return stages_[0].pass; }  // of the first chains; valid while this lives

@@ -85,6 +85,8 @@ class BlendFloat:
         d_values: Sequence[Tensor | None],
         threads: int,
     ) -> None: ...
+    def work(self) -> tuple[int, int]:
+        """Entries of all tile lists, and (Gaussian, 4x4 block, chain) triples weighed; needs ``keep`` and ``stop="after"``."""
 
 class BlendDouble(BlendFloat): ...
 

@@ -4,6 +4,7 @@ A skip is *exact* (the same numbers, to the bit or to float order), *bounded* (o
 *statistical*. One that costs nothing and loses nothing has no switch; it stands here because it explains the speed.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -165,6 +166,26 @@ def named(name: str) -> Skip:
         if skip.name == name:
             return skip
     raise ValueError(f"skips: name must be one of {[s.name for s in SKIPS]}, got {name!r}")
+
+
+def turn(names: Iterable[str], on: bool) -> tuple[str, ...]:
+    """The Hydra overrides that turn several skips on or off together.
+
+    Raises:
+        ValueError: If two of them want different values of one key.
+
+    Example:
+        >>> turn(["tile_test", "finite_check"], on=True)
+        ('raster.tile_test=true', 'trainer.skip.finite_check=true')
+    """
+    chosen: dict[str, str] = {}
+    for skip in map(named, names):
+        override = skip.override(on)
+        if chosen.setdefault(skip.setting, override) != override:
+            raise ValueError(
+                f"skips: {skip.setting} must have one value, got {chosen[skip.setting]} and {override} of {skip.name}"
+            )
+    return tuple(chosen.values())
 
 
 def markdown_table() -> str:

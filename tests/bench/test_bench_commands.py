@@ -1,13 +1,14 @@
 """The subcommands run, and their files say what they hold."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from vlgs.bench.__main__ import SUBCOMMANDS, main
 from vlgs.bench.growth import Point, run_growth
-from vlgs.bench.kernel import BOUND_RATE, Size, run_kernel
+from vlgs.bench.kernel import BOUND_RATE, SIZES, Figures, Job, Size, _elsewhere, run_kernel
 from vlgs.bench.sheet import read_sheet
 
 HEADER = {"command", "cpu", "cores", "isa", "load", "commit", "seed", "torch"}
@@ -20,25 +21,44 @@ def header(path: Path) -> set[str]:
 
 
 def test_kernel_times_both_parts_and_the_reference(tmp_path: Path):
-    rows = run_kernel(
-        [Size(60, 32, 24, 1.0, 2.0)], [Size(20, 16, 12)], [3, 5], [1], ["base"], 2, tmp_path
-    )
+    size = Size(60, 32, 24, 1.0, Figures(2.0, (6.0, 3.0)), Figures(4.0, (16.0, 8.0)))
+    dense = [Size(20, 16, 12)]
+    rows = run_kernel([size], dense, [3, 5, 16], [1], ["base"], 2, tmp_path)
     table = read_sheet(tmp_path / "kernel.csv")
     assert header(tmp_path / "kernel.csv") >= HEADER
     assert set(table) >= TIMES | {"job_threads", "isa", "repeats", "opensplat_ms", "ratio"}
-    assert list(table.job_part) == ["call", "blend"] * 2 + ["call", "reference"]
-    assert list(table.isa) == ["base"] * 5 + ["torch"]
+    assert list(table.job_part) == ["call", "blend"] * 3 + ["call", "reference"]
+    assert list(table.isa) == ["base"] * 7 + ["torch"]
     assert (table.forward_ms > 0).all()
     assert rows[0].ratio == pytest.approx(1.0 / (rows[0].forward.ms + rows[0].backward.ms))
-    assert table.opensplat_ms.notna().tolist() == [True, True, False, False, False, False]
-    # The bound is that of projected splats with 3 + 3 channels on two threads and another machine.
-    assert table.bound_ms.notna().tolist() == [False, True, False, False, False, False]
+    assert table.opensplat_ms.notna().tolist() == [True] * 2 + [False] * 6
+    # Bound and targets are of projected splats with 3 + 3 and 3 + 16 channels, the bound on two threads, on another machine.
+    for column in (table.bound_ms, table.target_ms):
+        assert column.notna().tolist() == [False, True, False, False, False, True, False, False]
     rate = re.search(r"multiply_add_rate: ([0-9.]+) G/s", (tmp_path / "kernel.csv").read_text())
     assert rate is not None
-    assert table.bound_ms[1] == pytest.approx(2 * 2.0 * BOUND_RATE / float(rate[1]), rel=0.01)
-    assert table.over_bound[1] == pytest.approx(
-        (table.forward_ms[1] + table.backward_ms[1]) / table.bound_ms[1], rel=1e-4
-    )  # six digits are written
+    slower = BOUND_RATE / float(rate[1])
+    for row, bound, target in ((1, 2.0, 6.0), (5, 4.0, 16.0)):
+        time = table.forward_ms[row] + table.backward_ms[row]
+        assert table.bound_ms[row] == pytest.approx(2 * bound * slower, rel=0.01)
+        assert table.target_ms[row] == pytest.approx(target * slower, rel=0.01)
+        for over, than in (("over_bound", "bound_ms"), ("over_target", "target_ms")):
+            # Six digits are written.
+            assert table[over][row] == pytest.approx(time / table[than][row], rel=1e-4)
+
+
+def test_bounds_and_targets_are_of_as_many_threads():
+    job = Job(*SIZES[0][:3], channels=16, threads=2, part="blend")
+    assert _elsewhere(SIZES[0], job, BOUND_RATE) == (8.7, 12.1)
+    assert _elsewhere(SIZES[0], replace(job, threads=1), BOUND_RATE) == (2 * 8.7, 22.9)
+    assert _elsewhere(SIZES[0], replace(job, threads=4), BOUND_RATE) == (8.7 / 2, None)
+    assert _elsewhere(SIZES[0], replace(job, channels=512), BOUND_RATE) == (None, None)
+    assert _elsewhere(SIZES[0], replace(job, part="call"), BOUND_RATE) == (None, None)
+    for size in SIZES:
+        for known in (size.figures(3), size.figures(16)):
+            assert known is not None
+            one, two = known.targets
+            assert known.bound < two < one
 
 
 def test_growth_has_slopes_within_a_series(tmp_path: Path):

@@ -22,6 +22,7 @@ from vlgs.bench.scenes import (
 from vlgs.bench.sheet import read_sheet
 from vlgs.bench.switches import check_switch, raster_switches
 from vlgs.bench.workload import Workload, make_workload
+from vlgs.render import cpu
 from vlgs.types import RasterConfig
 
 
@@ -89,8 +90,52 @@ def test_a_wrong_float64_kernel_differs_from_the_reference(monkeypatch: pytest.M
 def test_switches_hold_on_one_weight_too(w: Workload):
     for scene in (w, with_one_weight(w)):
         measured = [c for switch in raster_switches() for c in check_switch("w", scene, switch)]
-        assert measured
         assert violated(measured) == []
+        # The same bits where that is the promise.
+        assert [c.bound for c in measured[:4]] == [0.0, 0.0, 0.0, checks.EXACT]
+
+
+def one_tile(gaussians: int) -> Workload:
+    """As many behind each other, each of which covers all of one tile up to the clamp."""
+    w = in_precision(make_workload(gaussians, 16, 16), torch.float32)
+    means = torch.zeros(gaussians, 3)
+    means[:, 2] = torch.arange(gaussians) + 2.0
+    ones = torch.ones(gaussians)
+    color, language = (replace(group, weight=ones) for group in w.groups)
+    scales = torch.full((gaussians, 3), 1e3)
+    return w._replace(means=means, scales=scales, groups=(color, language))
+
+
+def test_skipped_work_is_counted_by_hand():
+    """0.01 of the light is left behind one, 1e-4 behind two: the third crosses the threshold, and the other two are not reached."""
+    w, config = one_tile(5), RasterConfig(transmittance_min=1e-5)
+    count = switches._count(w, config)
+    assert count == (5, 3 * 16)  # one chain, as both groups have one weight
+    assert switches._count(w, replace(config, share_chains=False)) == (5, 2 * 3 * 16)
+    assert switches._count(w, replace(config, transmittance_min=0.0)) == (5, 5 * 16)
+    shares = {s.skip.name: switches.skipped_share(w, s) for s in raster_switches()}
+    assert shares["shared_chain"] == 0.5
+    assert shares["tile_test"] == shares["block_masks"] == 0
+    assert 0 < shares["early_stop"] < 1
+
+
+def test_skipped_blocks_are_those_of_the_masks():
+    """Without masks and stop every entry of a list is weighed in all 16 blocks, on each of two chains."""
+    w, off = make_workload(120, 32, 48), RasterConfig(block_masks=False, transmittance_min=0.0)
+    entries, weighed = switches._count(w, off)
+    assert weighed == entries * 16 * 2
+    by_masks = switches._count(w, replace(off, block_masks=True))
+    assert by_masks.entries == entries
+    assert entries < by_masks.weighed < weighed
+    boxes = switches._count(w, replace(off, tile_test=False))
+    assert boxes.entries > entries
+    # More chains than one pass over the tiles carries.
+    splats = cpu.project(w.means, w.quats, w.scales, w.camera, off)
+    groups = [replace(w.groups[0], weight=w.groups[0].weight.clone()) for _ in range(5)]
+    n = cpu.count_work(splats, groups[:1], w.camera, off).entries
+    assert cpu.count_work(splats, groups, w.camera, off) == (n, 5 * 16 * n)
+    with pytest.raises(ValueError, match="stop must be after where work is counted, got before"):
+        switches._count(w, replace(off, stop="before"))
 
 
 def test_not_a_number_keeps_no_promise():
@@ -122,12 +167,13 @@ def test_error_and_pareto_write_their_files(tmp_path: Path, w: Workload):
     assert error.run_error({"tiny": w}, None, [1], 1, tmp_path, 0) == []
     table = read_sheet(tmp_path / "error.csv")
     assert set(table) >= {
-        "scene", "variant", "precision", "threads", "truth", "forward_ms", "backward_cpu",
+        "scene", "variant", "precision", "threads", "truth", "forward_ms", "backward_cpu", "skipped",
         "memory_rss_mib", "memory_extra_mib", "error_image_max", "error_image_mean",
         *(f"error_{kind}_{name}" for kind in ("l2", "cos") for name in LEAVES),
         "quality_psnr", "quality_miou_change",
     }  # fmt: skip
     assert {"exact", "default", "fast", "early_stop off"} <= set(table.variant)
+    assert (table.skipped.notna() == (table.group == "switch")).all()
     double = table[(table.precision == "float64") & (table.truth == "same_cutoffs")]
     assert (double.error_image_max == 0).all()
     assert (table[table.truth == "no_cutoffs"].error_image_max > 0).all()
@@ -143,11 +189,11 @@ def test_a_broken_bound_is_status_1(
 ):
     monkeypatch.setattr(error, "_measure", lambda *_: [checks.Check("s", "p", 0.0, 0.0)])
     monkeypatch.setattr(error, "_print", lambda _: None)
-    arguments = ["error", "--quick", "--out", str(tmp_path)]
+    arguments = ["error", "--quick", "--no-trained", "--out", str(tmp_path)]
     assert __main__.main(arguments) == 0
     monkeypatch.setattr(checks, "EXACT", -1.0)
     assert __main__.main(arguments) == 1
-    assert "tile_test: on against off must be at most -1.00e+00" in capsys.readouterr().err
+    assert "shared_chain: on against off must be at most -1.00e+00" in capsys.readouterr().err
     assert switches.raster_switches()
 
 

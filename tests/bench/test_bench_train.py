@@ -8,11 +8,39 @@ from vlgs.bench import curve, train
 from vlgs.bench.curve import evaluated_at, seconds_to
 from vlgs.bench.presets import composed
 from vlgs.bench.sheet import read_sheet
+from vlgs.skips import SKIPS
 
 
 @pytest.mark.parametrize("label", train.RECIPES)
 def test_every_recipe_is_a_configuration(label: str):
     composed(train.RECIPES[label])
+
+
+def test_all_and_no_skips_say_each_key_once():
+    on, off = (train.RECIPES[name] for name in ("all skips", "no skips"))
+    assert composed(on).trainer.skip.blend_weight == 0.5
+    # Every blended view is rendered, of pairs without similarity too.
+    assert composed(off).trainer.skip.blend_weight == -1.0
+    for recipe in (on, off):
+        keys = [override.partition("=")[0] for override in recipe]
+        assert len(keys) == len(set(keys))
+    keys = {skip.setting for skip in SKIPS if skip.switchable}
+    assert {override.partition("=")[0] for override in off} == keys
+    assert {override.partition("=")[0] for override in on} == keys - {"raster.transmittance_min"}
+
+
+def test_photographs_are_told_where_their_language_is():
+    root = Path("scene")
+    further = ["data.features=maps", "query=vocab_softmax"]
+    scenes = train.scene_overrides(root, 0.5, False, synthetic=False, further=further)
+    assert list(scenes) == ["photographs"]
+    config = composed(scenes["photographs"])
+    assert (config.data.root, config.data.resize, config.data.features) == ("scene", 0.5, "maps")
+    assert list(train.scene_overrides(root, 1.0, True)) == ["synthetic", "photographs"]
+    with pytest.raises(ValueError, match=r"data.features=maps .* must come with --root SCENE"):
+        train.scene_overrides(None, 0.5, False, further=further)
+    with pytest.raises(ValueError, match=r"--no-synthetic must come with --root SCENE"):
+        train.scene_overrides(None, 0.5, False, synthetic=False)
 
 
 def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

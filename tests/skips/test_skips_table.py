@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from tiny_runs import composed
 
 from vlgs.config import instantiate
-from vlgs.skips import SKIPS, Skip, markdown_table, named
+from vlgs.skips import SKIPS, Skip, markdown_table, named, turn
 
 README = Path(__file__).parents[2] / "README.md"
 SWITCHES = [skip for skip in SKIPS if skip.switchable]
@@ -38,6 +38,16 @@ def test_what_has_no_switch_cannot_be_turned():
 def test_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match=r"skips: name must be one of .*, got 'cull'"):
         named("cull")
+
+
+def test_two_skips_of_one_key_do_not_override_each_other():
+    key = "trainer.skip.blend_weight"
+    with pytest.raises(
+        ValueError,
+        match=rf"skips: {key} must have one value, got {key}=0.0 and {key}=0.5 of blend_small",
+    ):
+        turn(["blend_zero", "tile_test", "blend_small"], on=True)
+    assert turn(["blend_zero", "blend_zero"], on=False) == (f"{key}=-1.0",)
 
 
 def test_readme_shows_the_table():

@@ -5,9 +5,11 @@ from pathlib import Path
 import pytest
 
 from vlgs.bench import stress
+from vlgs.bench.__main__ import main
 from vlgs.bench.sheet import read_sheet
-from vlgs.bench.stress.case import Case, Verdict
-from vlgs.bench.stress.sheet import run_cases, show_table
+from vlgs.bench.stress import bits
+from vlgs.bench.stress.case import CannotRunError, Case, Verdict
+from vlgs.bench.stress.sheet import FAILED, NOT_RUN, run_cases, show_table
 
 SLOW = (
     "N1 poisoned gradients",
@@ -24,7 +26,10 @@ def marked(case: Case):
 
 @pytest.mark.parametrize("case", [marked(case) for case in stress.CASES])
 def test_case(case: Case):
-    verdict = case.run(False)
+    try:
+        verdict = case.run(False)
+    except CannotRunError as reason:
+        pytest.skip(str(reason))
     assert verdict.passed, f"{case.criterion}\nmeasured: {verdict.measured}"
 
 
@@ -45,6 +50,24 @@ def test_a_failure_and_an_exception_are_failures(tmp_path: Path):
 
     path = tmp_path / "out" / "stress.csv"
     rows = run_cases([Case("N1 a", fails), Case("N2 b", breaks)], False, path)
-    assert [row.passed for row in rows] == [False, False]
+    assert [row.outcome for row in rows] == [FAILED, FAILED]
     assert show_table(rows).row_count == 2
     assert list(read_sheet(path).measured) == ["7 (<= 3)", "RuntimeError: no"]
+
+
+def test_what_the_machine_cannot_run_has_neither_passed_nor_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(bits, "_in_process", lambda isa, full: {"isa": ["base"]})
+    monkeypatch.setattr(bits._csrc, "isa", lambda: "base")
+    cases = tuple(case for case in stress.CASES if case.name.endswith((", v4", ", v3")))
+    monkeypatch.setattr(stress, "CASES", cases)
+    assert main(["stress", "--out", str(tmp_path)]) == 0
+    assert list(read_sheet(tmp_path / "stress.csv").outcome) == [NOT_RUN, NOT_RUN]
+    text = " ".join(capsys.readouterr().out.split())
+    assert "N12 threads and repeats, v3: not run, this machine has base at best" in text
+    assert "not run on this machine: 2 of 2 (N12 threads and repeats, v4; N12" in text
+
+    broken = Case("N1 a", lambda full: Verdict("7 (<= 3)", False))
+    monkeypatch.setattr(stress, "CASES", (*cases, broken))
+    assert main(["stress", "--out", str(tmp_path)]) == 1

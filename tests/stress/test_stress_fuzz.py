@@ -1,12 +1,17 @@
 """The fuzzer itself: scenes are functions of their seed, and what it must catch it catches."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from math import inf, isnan, nan
+from typing import Any
 
 import pytest
 import torch
 
+from vlgs import _csrc
 from vlgs.bench import fuzz
 from vlgs.bench.fuzz import run_scene
+from vlgs.bench.fuzz_layers import run_layers
 from vlgs.bench.fuzz_scene import SWITCHES, FuzzScene, make_scene
 from vlgs.types import ChannelGroup
 
@@ -99,3 +104,42 @@ def test_numbers_that_are_not_finite_are_failures(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(fuzz, "rasterize", poisoned)
     seed = next(seed for seed in range(100) if make_scene(seed).tame)
     assert "picture 0 is not finite" in str(fuzz.fuzz([seed]))
+
+
+squared_error, squared_error_backward = _csrc.squared_error, _csrc.squared_error_backward
+
+
+def reads_everything(a: Any, b: Any, valid: Any, threads: int) -> tuple[float, int]:
+    return squared_error(a, b, None, threads)[0], squared_error(a, b, valid, threads)[1]
+
+
+def counts_one_more(*args: Any) -> tuple[float, int]:
+    total, count = squared_error(*args)
+    return total, count + 1
+
+
+def hides_what_is_no_number(*args: Any) -> tuple[float, int]:
+    total, count = squared_error(*args)
+    return 0.0 if isnan(total) else total, count
+
+
+def moves_masked_pixels(a: Any, b: Any, valid: Any, scale: float, d_a: Any, threads: int) -> None:
+    squared_error_backward(a, b, None, scale, d_a, threads)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [reads_everything, counts_one_more, hides_what_is_no_number, moves_masked_pixels],
+)
+def test_a_wrong_squared_error_is_a_failure(
+    monkeypatch: pytest.MonkeyPatch, wrong: Callable[..., Any]
+):
+    def run() -> None:
+        for seed in range(60):
+            run_layers(seed, (nan, inf, 1e38))
+
+    run()
+    backward = wrong is moves_masked_pixels
+    monkeypatch.setattr(_csrc, "squared_error" + "_backward" * backward, wrong)
+    with pytest.raises(AssertionError, match=r"squared error must be that of float64"):
+        run()

@@ -44,7 +44,8 @@ def error(parser: ArgumentParser) -> Runner:
 
     def run(args: Namespace) -> int:
         from vlgs.bench.error import make_scenes, run_error
-        from vlgs.bench.presets import load_run, train_or_load
+        from vlgs.bench.presets import load_run, train_a_little, train_or_load
+        from vlgs.bench.train import QUICK
 
         sizes = [(400, 64, 48)] if args.quick else [(50_000, 320, 240), (200_000, 640, 480)]
         trained = None
@@ -52,9 +53,12 @@ def error(parser: ArgumentParser) -> Runner:
             trained = load_run(args.run)
         elif not args.no_trained and not args.quick:
             trained = train_or_load([f"seed={args.seed}"], Path("results"))
+        stepping = trained
+        if args.quick and not args.no_trained and trained is None:
+            stepping = train_a_little([*QUICK, "codec.cache_dir=null", f"seed={args.seed}"])
         scenes = make_scenes(sizes, trained, args.seed)
         repeats = 3 if args.quick else args.repeats
-        broken = run_error(scenes, trained, args.threads, repeats, args.out, args.seed)
+        broken = run_error(scenes, trained, args.threads, repeats, args.out, args.seed, stepping)
         for check in broken:
             print(
                 f"error: {check.scene}: {check.promise} must be at most {check.bound:.2e}, got {check.measured:.2e}",
@@ -96,6 +100,11 @@ def train(parser: ArgumentParser) -> Runner:
     parser.add_argument("--recipes", nargs="+", help="labels of vlgs/bench/train.py; default: all")
     parser.add_argument("--root", type=Path, help="a scene of photographs (data=colmap data.root=)")
     parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
+    parser.add_argument(
+        "--override", nargs="+", default=[], metavar="KEY=VALUE",
+        help="of the photographs, e.g. data.features=FOLDER query=vocab_softmax",
+    )  # fmt: skip
+    parser.add_argument("--no-synthetic", action="store_true", help="the photographs alone")
     parser.add_argument("--points", type=int, default=8, help="evaluations per curve")
     parser.add_argument("--train-threads", type=int, default=2)
     parser.add_argument("--psnr", type=float, help="target in dB; default: that of default - 1")
@@ -108,7 +117,9 @@ def train(parser: ArgumentParser) -> Runner:
         unknown = sorted(set(labels) - set(RECIPES))
         if unknown:
             raise ValueError(f"bench: recipe must be one of {', '.join(RECIPES)}, got {unknown[0]}")
-        scenes = scene_overrides(args.root, args.resize, args.quick)
+        scenes = scene_overrides(
+            args.root, args.resize, args.quick, not args.no_synthetic, args.override
+        )
         points = 2 if args.quick else args.points
         targets = (args.psnr, args.miou)
         run_train(scenes, labels, args.out, points, args.train_threads, args.seed, targets)
@@ -200,7 +211,7 @@ def stress(parser: ArgumentParser) -> Runner:
         from rich.console import Console
 
         from vlgs.bench.stress import CASES
-        from vlgs.bench.stress.sheet import run_cases, show_table
+        from vlgs.bench.stress.sheet import FAILED, run_cases, show_table
 
         cases = [c for c in CASES if not args.only or any(part in c.name for part in args.only)]
         if not cases:
@@ -209,7 +220,7 @@ def stress(parser: ArgumentParser) -> Runner:
         rows = run_cases(cases, not args.quick, path)
         console = Console()
         console.print(show_table(rows), width=max(console.width, 140))
-        return int(any(not row.passed for row in rows))
+        return int(any(row.outcome == FAILED for row in rows))
 
     return run
 

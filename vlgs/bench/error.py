@@ -18,7 +18,8 @@ from vlgs.bench.presets import Trained, raster_presets
 from vlgs.bench.quality import Quality, measure_quality
 from vlgs.bench.scenes import in_precision, save_workload, view_of, with_one_weight
 from vlgs.bench.sheet import provenance, say, show, write_sheet
-from vlgs.bench.switches import check_switch, raster_switches
+from vlgs.bench.steps import StepRow, measure_switches
+from vlgs.bench.switches import RasterSwitch, check_switch, raster_switches, skipped_share
 from vlgs.bench.workload import Workload, make_workload
 from vlgs.types import RasterConfig
 
@@ -35,6 +36,7 @@ class Variant(NamedTuple):
     precision: str
     threads: int
     config: RasterConfig
+    switch: RasterSwitch | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class ErrorRow:
     forward: Spread
     backward: Spread
     repeats: int
+    skipped: float | None
+    """Of a switch: share of the work that is left out where it is on, whatever this row has it (`skipped_share`)."""
     memory: Memory
     error: Errors
     quality: Quality
@@ -86,8 +90,18 @@ def run_error(
     repeats: int,
     out: Path,
     seed: int,
+    stepping: Trained | None = None,
 ) -> list[Check]:
-    """Measure every variant on every scene; write error.csv and error_checks.csv.
+    """Measure every variant on every scene; write error.csv and error_checks.csv, and error_steps.csv for training.
+
+    Args:
+        scenes: What is rendered.
+        trained: Whose scores are taken on scenes that are its own.
+        threads: Of presets; switches are measured on the first.
+        repeats: Times that each is timed.
+        out: Folder of the files.
+        seed: Of the workloads, for the record.
+        stepping: Whose training steps are measured, with each switch of training on and off; None: no such file.
 
     Returns:
         The promises that were not kept.
@@ -107,9 +121,17 @@ def run_error(
         checks += check_presets(name, w, presets) + check_rounding(name, w)
         for switch in raster_switches():
             checks += check_switch(name, w, switch)
+    steps: list[StepRow] = []
+    if stepping is not None:
+        name, module = stepping.scene.name, stepping.module
+        say(f"training steps on {name} ...")
+        steps, kept = measure_switches(f"steps {name}", module, threads[0], repeats)
+        checks += kept
+        write_sheet(out / "error_steps.csv", steps, header)
     write_sheet(out / "error.csv", rows, header)
     write_sheet(out / "error_checks.csv", checks, header)
     _print(rows)
+    _print_steps(steps)
     print_checks(checks)
     return violated(checks)
 
@@ -121,7 +143,7 @@ def _variants(presets: Mapping[str, RasterConfig], threads: Sequence[int]) -> li
     ]
     for switch in raster_switches():
         label, config = switch.turned(presets["default"])
-        variants.append(Variant(label, "switch", "float32", threads[0], config))
+        variants.append(Variant(label, "switch", "float32", threads[0], config, switch))
     return variants
 
 
@@ -148,6 +170,7 @@ def _measure(
         if v.config not in qualities:
             qualities[v.config] = measure_quality(trained, v.config, presets["exact"])
         forward, backward = spreads(samples[v])
+        skipped = None if v.switch is None else skipped_share(w, v.switch)
         for label, config in (
             ("no_cutoffs", without_cutoffs(v.config)),
             ("same_cutoffs", v.config),
@@ -158,7 +181,7 @@ def _measure(
             rows.append(
                 ErrorRow(
                     name, len(w.means), c.width, c.height, *v[:4], label, forward, backward,
-                    repeats, memory[v], compare(got, truth[config]), qualities[v.config],
+                    repeats, skipped, memory[v], compare(got, truth[config]), qualities[v.config],
                 )
             )  # fmt: skip
     return rows
@@ -197,16 +220,43 @@ def _print(rows: Sequence[ErrorRow]) -> None:
                     r.variant, r.precision, f"{r.threads}", f"{r.forward.ms:.1f}", f"{r.backward.ms:.1f}",
                     f"{r.forward.cpu + r.backward.cpu:.1f}", f"{r.memory.extra_mib:.0f}",
                     f"{r.error.image_max:.1e}", f"{r.error.image_mean:.1e}", f"{r.error.gradient:.1e}",
-                    f"{same.error.image_max:.1e}", f"{same.error.gradient:.1e}", *quality,
+                    f"{same.error.image_max:.1e}", f"{same.error.gradient:.1e}", _percent(r.skipped), *quality,
                 )
             )  # fmt: skip
         columns = ("variant", "precision", "threads", "forward", "backward", "CPU", "+MiB")
         errors = ("max", "mean", "gradient", "max, same", "gradient, same")
         show(
             f"{scene}: ms (median wall; CPU of all threads), errors against float64 without cut-offs and with the same",
-            (*columns, *errors, "PSNR", "mIoU"),
+            (*columns, *errors, "skipped", "PSNR", "mIoU"),
             lines,
         )
+
+
+def _print_steps(rows: Sequence[StepRow]) -> None:
+    lines = []
+    for r in rows:
+        gradient = max((v for v in r.l2.values() if v is not None), default=0.0)
+        cpu = [f"{a.cpu + b.cpu:.1f}" for a, b in ((r.on_forward, r.on_backward), (r.off_forward, r.off_backward))]  # fmt: skip
+        times = [f"{t.ms:.1f}" for t in (r.on_forward, r.off_forward, r.on_backward, r.off_backward)]  # fmt: skip
+        bound = "" if r.loss_bound is None else f"{r.loss_bound:.1e}"
+        lines.append(
+            (
+                r.switch, r.kind, r.default, *times, *cpu, _percent(r.skipped),
+                f"{r.loss_error:.1e}", bound, f"{r.loss:.2g}", f"{r.image_max:.1e}", f"{gradient:.1e}",
+            )
+        )  # fmt: skip
+    if rows:
+        columns = ("forward on", "off", "backward on", "off", "CPU on", "off", "skipped")
+        errors = ("loss moves", "bound", "of", "max", "gradient")
+        show(
+            f"{rows[0].scene}, {rows[0].gaussians:,} Gaussians: ms per training step without Adam, the skip on and off",
+            ("switch", "class", "default", *columns, *errors),
+            lines,
+        )
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{share:.1%}"
 
 
 def print_checks(checks: Sequence[Check]) -> None:

@@ -1,7 +1,8 @@
-"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, the window of SSIM, frozen views, the yardstick.
+"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, losses, frozen views, the yardstick.
 
 What `vlgs.bench.fuzz` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
-four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite.
+four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite. Squared errors are
+compared with those of torch in float64, whatever the numbers are.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from torch import Tensor
 from vlgs import _csrc
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.gaussians.sh import view_color
-from vlgs.losses import ssim_map
+from vlgs.losses import masked_mse, ssim_map
 from vlgs.render.frozen import FrozenView
 from vlgs.types import Camera, RasterConfig
 
@@ -22,6 +23,8 @@ LONG = (2047, 2048, 2049, 4100)
 """Around the chunks that one thread takes."""
 SIDES = (1, 2, 10, 11, 12, 15, 16, 17, 33)
 """Around the window and the lanes."""
+CHUNK = 1 << 14
+"""Numbers that one thread takes of squared errors; 16 such chunks are worth another thread."""
 
 
 def run_layers(seed: int, poison: tuple[float, ...]) -> None:
@@ -32,12 +35,14 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
         poison: What is strewn in.
 
     Raises:
-        AssertionError: If a shape is wrong, or a number is not finite though all that went in were ordinary.
+        AssertionError: If a shape is wrong, a number is not finite though all that went in were ordinary, or a squared error is
+            not that of torch.
     """
     rng = np.random.default_rng([seed, 1])
     for run in (_attention, _view_color, _window):
         bad = float(rng.choice(poison)) if rng.random() < 0.25 else None
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
+    _squared_error(rng, poison)
     packs = int(rng.integers(0, 1000))
     _require(_csrc.multiply_adds(packs) >= packs, "the yardstick did less than it was asked for")
 
@@ -110,6 +115,53 @@ def _window(rng: np.random.Generator) -> Call:
     return lambda a, b: (ssim_map(a, b),), images
 
 
+def _squared_error(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
+    """`masked_mse` against its definition: where no pixel counts, where few do, and with anything where none is looked at."""
+    dtype, channels = _dtype(rng), int(rng.choice([1, 2, 3, 15, 16, 17, 40]))
+    height, width = (int(rng.choice(SIDES)) for _ in "hw")
+    if rng.random() < 0.1:  # around a chunk, or enough of them for several threads
+        height = CHUNK // channels // width + int(rng.integers(-1, 2)) + 1
+        height *= 17 if rng.random() < 0.2 else 1
+    images = [
+        _normal(rng, dtype, height, width, channels) * 10.0 ** rng.uniform(-4, 4) for _ in "ab"
+    ]
+    counts = torch.from_numpy(rng.random((height, width)) < rng.choice([0.0, 0.02, 0.5, 0.98, 1.0]))
+    valid = counts if rng.random() < 0.8 else None
+    if valid is not None:
+        images[1][~valid] = _cast(rng.choice(poison), dtype)
+    if rng.random() < 0.25:
+        picked = images[int(rng.integers(2))].view(-1)
+        for _ in range(int(rng.integers(1, 4))):
+            picked[int(rng.integers(len(picked)))] = _cast(rng.choice(poison), dtype)
+    pixels = "valid" if rng.integers(2) else "all"
+    render, target = (image.requires_grad_() for image in images)
+    loss, scale = masked_mse(render, target, valid, pixels), _cast(rng.standard_normal(), dtype)
+    d_render, d_target = torch.autograd.grad(loss, (render, target), scale)
+
+    counted = torch.ones_like(counts) if valid is None else valid
+    gaps = (render.detach().double() - target.detach().double()).masked_fill(~counted[..., None], 0)
+    number = max(gaps.numel() if pixels == "all" else int(counted.sum()) * channels, 1)
+    # A lane sums up to 2^10 squares of a chunk in the type of the images.
+    eps, most = 1e3 * torch.finfo(dtype).eps, torch.finfo(dtype).max
+    _agree("squared error", loss, gaps.square().sum() / number, gaps.square().sum() < most / 4, eps)
+    d_gaps = 2 * scale.double() / number * gaps
+    in_range = gaps.abs().maximum(d_gaps.abs()) < most / 4
+    _agree("gradient of a squared error", d_render, d_gaps, in_range, eps)
+    opposite = torch.equal(d_target.nan_to_num(7), (-d_render).nan_to_num(7))
+    _require(opposite, "squared error: gradients must be opposite")
+
+
+def _agree(name: str, got: Tensor, want: Tensor, in_range: Tensor, relative: float) -> None:
+    """Where the truth, in float64, is within the range of the type it is what came out, to rounding; elsewhere nothing finite but it is.
+
+    Not a number is one on both sides; what the type cannot hold may be infinite instead.
+    """
+    smallest = torch.finfo(got.dtype).tiny
+    same = torch.isclose(got.detach().double(), want, rtol=relative, atol=smallest, equal_nan=True)
+    fine = same | (~in_range & ~got.isfinite())
+    _require(bool(fine.all()), f"{name} must be that of float64")
+
+
 def _differentiate(
     name: str,
     call: Callable[..., tuple[Tensor, ...]],
@@ -121,7 +173,7 @@ def _differentiate(
         picked = inputs[int(rng.integers(len(inputs)))]
         if picked.numel():
             row = int(rng.integers(picked.numel()))
-            picked.view(-1)[row] = torch.tensor(bad, dtype=torch.float64).to(picked.dtype)
+            picked.view(-1)[row] = _cast(bad, picked.dtype)
     leaves = [t.clone().requires_grad_() for t in inputs]
     outputs = call(*leaves)
     upstream = [_normal(rng, out.dtype, *out.shape) for out in outputs]
@@ -131,6 +183,10 @@ def _differentiate(
     if bad is None:
         found = [*outputs, *(g for g in grads if g is not None)]
         _require(all(bool(t.isfinite().all()) for t in found), f"{name}: must stay finite")
+
+
+def _cast(number: float, dtype: torch.dtype) -> Tensor:
+    return torch.tensor(float(number), dtype=torch.float64).to(dtype)
 
 
 def _normal(rng: np.random.Generator, dtype: torch.dtype, *shape: int) -> Tensor:

@@ -26,6 +26,17 @@ REFERENCE_BYTES = 80
 """Memory of the dense reference and its gradients per Gaussian, pixel and pair of groups, bytes: an estimate, not measured."""
 
 
+class Figures(NamedTuple):
+    """What the same work took elsewhere: forward and backward from projected splats, ms, on a machine with `BOUND_RATE`."""
+
+    bound: float
+    """Lane-limited bound on 2 cores: live 4x4 blocks times the time of one in a loop of its own. An estimate for one kernel, no
+    law of nature."""
+    targets: tuple[float, float]
+    """A prototype for AVX-512 with tile lists and blocks like ours, on 1 and on 2 threads: what a simple kernel reaches that has no
+    fixed order of sums, no choice of channels at run time and no float64."""
+
+
 class Size(NamedTuple):
     """One scene of the workload."""
 
@@ -35,21 +46,26 @@ class Size(NamedTuple):
     opensplat_ms: float | None = None
     """OpenSplat 15b7e800, `rasterizer/gsplat-cpu`, colour and language as two passes of three channels, forward and backward
     from projected splats; it has one thread. Median on an idle 2-core AMD EPYC (Zen 5, 4.4 GHz): other machines differ."""
-    bound_ms: float | None = None
-    """Lane-limited bound of forward and backward from projected splats, 3 + 3 channels, on 2 cores of a machine with
-    `BOUND_RATE`: live 4x4 blocks times the time of one in a loop of its own. An estimate for one kernel, no law of nature."""
+    narrow: Figures | None = None
+    """3 + 3 channels."""
+    wide: Figures | None = None
+    """3 + 16 channels."""
+
+    def figures(self, channels: int) -> Figures | None:
+        """Those of so many channels of language."""
+        return {3: self.narrow, 16: self.wide}.get(channels)
 
 
 SIZES = (
-    Size(10_000, 320, 240, 398, 6.1),
-    Size(50_000, 320, 240, 483, 7.7),
-    Size(200_000, 320, 240, 699, 10.7),
-    Size(10_000, 640, 480, 1867, 21.9),
-    Size(50_000, 640, 480, 2160, 25.0),
-    Size(200_000, 640, 480, 2784, 30.6),
+    Size(10_000, 320, 240, 398, Figures(6.1, (16.8, 9.4)), Figures(8.7, (22.9, 12.1))),
+    Size(50_000, 320, 240, 483, Figures(7.7, (24.4, 12.8)), Figures(11.0, (34.6, 19.5))),
+    Size(200_000, 320, 240, 699, Figures(10.7, (58.5, 32.3)), Figures(15.3, (81.8, 43.8))),
+    Size(10_000, 640, 480, 1867, Figures(21.9, (58.6, 29.7)), Figures(31.3, (82.6, 42.6))),
+    Size(50_000, 640, 480, 2160, Figures(25.0, (71.1, 37.0)), Figures(35.8, (103.4, 55.5))),
+    Size(200_000, 640, 480, 2784, Figures(30.6, (123.0, 68.1)), Figures(43.8, (175.7, 95.0))),
 )
 BOUND_RATE = 9.0
-"""Of the machine on which `Size.bound_ms` was measured: 16-lane multiply-adds of floats per core, 1e9 per second."""
+"""Of the machine of `Figures` (4.45 GHz): 16-lane multiply-adds of floats per core, 1e9 per second."""
 DENSE_SIZES = (Size(300, 80, 60), Size(1_000, 160, 120), Size(300, 320, 240))
 """What the dense reference can do within a few GiB."""
 
@@ -84,9 +100,13 @@ class KernelRow:
     ratio: float | None
     """OpenSplat's time over ours, forward and backward together."""
     bound_ms: float | None
-    """`Size.bound_ms` for this machine's rate and this many threads; where it holds."""
+    """`Figures.bound` for this machine's rate and this many threads; where it holds."""
     over_bound: float | None
     """Our time over that, forward and backward together: this compares between machines."""
+    target_ms: float | None
+    """`Figures.targets` for this machine's rate, where the prototype ran on as many threads."""
+    over_target: float | None
+    """Our time over that; below 1 is faster than the prototype."""
 
 
 def run_kernel(
@@ -168,12 +188,25 @@ def _measure(
         peer = size.opensplat_ms if channels == 3 else None
         ratio = None if peer is None else peer / (forward.ms + backward.ms)
         isa = "torch" if job.part == "reference" else isa
-        bound = None
-        if size.bound_ms is not None and channels == 3 and job.part == "blend":
-            bound = size.bound_ms * (2 / job.threads) * (BOUND_RATE / rate)
-        over = None if bound is None else (forward.ms + backward.ms) / bound
-        rows.append(KernelRow(job, isa, forward, backward, len(passes), peer, ratio, bound, over))
+        total = forward.ms + backward.ms
+        bound, target = _elsewhere(size, job, rate)
+        over = [None if known is None else total / known for known in (bound, target)]
+        rows.append(
+            KernelRow(
+                job, isa, forward, backward, len(passes), peer, ratio, bound, over[0], target, over[1]
+            )
+        )  # fmt: skip
     return rows
+
+
+def _elsewhere(size: Size, job: Job, rate: float) -> tuple[float | None, float | None]:
+    """Bound and target for a machine of this rate; None where there is none for the job."""
+    known = size.figures(job.channels)
+    if known is None or job.part != "blend":
+        return None, None
+    slower = BOUND_RATE / rate
+    target = known.targets[job.threads - 1] * slower if job.threads in (1, 2) else None
+    return known.bound * (2 / job.threads) * slower, target
 
 
 def _time_in(child: Child, job: Job, seed: int) -> Pass:
@@ -246,18 +279,20 @@ def _print(rows: Sequence[KernelRow]) -> None:
     for r in rows:
         peer = ("", "") if r.ratio is None else (f"{r.opensplat_ms:.0f}", f"{r.ratio:.1f}")
         bound = ("", "") if r.bound_ms is None else (f"{r.bound_ms:.1f}", f"{r.over_bound:.2f}")
+        target = ("", "") if r.target_ms is None else (f"{r.target_ms:.1f}", f"{r.over_target:.2f}")
         lines.append(
             (
                 f"{r.job.gaussians:,}", f"{r.job.width}x{r.job.height}", f"3+{r.job.channels}",
                 f"{r.job.threads}", r.isa, r.job.part,
                 f"{r.forward.ms:.1f} [{r.forward.q1:.1f}, {r.forward.q3:.1f}]",
                 f"{r.backward.ms:.1f} [{r.backward.q1:.1f}, {r.backward.q3:.1f}]",
-                f"{r.forward.ms + r.backward.ms:.1f}", f"{r.forward.cpu + r.backward.cpu:.1f}", *peer, *bound,
+                f"{r.forward.ms + r.backward.ms:.1f}", f"{r.forward.cpu + r.backward.cpu:.1f}", *peer, *bound, *target,
             )
         )  # fmt: skip
     columns = ("Gaussians", "image", "channels", "threads", "ISA", "part", "forward", "backward")
+    yardsticks = ("both", "CPU", "OpenSplat", "ratio", "bound", "over it", "target", "over target")
     show(
         "rasterizer, ms: median [quartiles] of wall clock; CPU sums over threads",
-        (*columns, "both", "CPU", "OpenSplat", "ratio", "bound", "over it"),
+        (*columns, *yardsticks),
         lines,
     )

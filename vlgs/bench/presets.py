@@ -73,6 +73,16 @@ def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
     return Trained(config, scene, module)
 
 
+def train_a_little(overrides: Sequence[str], steps: int = 25) -> Trained:
+    """A scene after its first iterations, without densification; nothing is written."""
+    config = composed(overrides)
+    scene = instantiate(config.data)
+    module = build(config, scene)
+    for step in range(steps):
+        module.training_step(step, step)
+    return Trained(config, scene, module)
+
+
 def load_run(path: Path) -> Trained:
     """A scene that `python -m vlgs.run` trained.
 

@@ -25,7 +25,7 @@ from vlgs.bench.sheet import (
 from vlgs.config import instantiate, run_id
 from vlgs.module.fit import FitOptions, fit
 from vlgs.runs import RunFolder
-from vlgs.skips import SKIPS
+from vlgs.skips import SKIPS, turn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,14 +34,14 @@ BASE = ("codec.cache_dir=null",)
 
 
 def _skips(on: bool) -> tuple[str, ...]:
-    """Every switch that loses nothing, or no more than its bound, turned on; or every one turned off."""
-    chosen: dict[str, str] = {}
-    for skip in SKIPS:
-        if skip.switchable and (
-            not on or (skip.kind != "statistical" and skip.name != "early_stop")
-        ):
-            chosen[skip.setting] = skip.override(on)
-    return tuple(chosen.values())
+    """Every switch that loses nothing, or no more than its bound, turned on; or every one turned off.
+
+    Two skips turn one key, ``blend_weight``: on, what ``blend_small`` leaves out includes what ``blend_zero`` does; off, the other way
+    round. A stop where `early_stop` is on belongs to the preset.
+    """
+    left = {"early_stop", "blend_zero"} if on else {"blend_small"}
+    left |= {skip.name for skip in SKIPS if on and skip.kind == "statistical"}
+    return turn((s.name for s in SKIPS if s.switchable and s.name not in left), on)
 
 
 RECIPES: dict[str, tuple[str, ...]] = {
@@ -85,14 +85,36 @@ class Summary:
     cpu_to_miou: float | None
 
 
-def scene_overrides(root: Path | None, resize: float, quick: bool) -> dict[str, tuple[str, ...]]:
-    """Procedural always; the photographs at `root` where one is given."""
-    scenes: dict[str, tuple[str, ...]] = {"synthetic": QUICK if quick else ()}
-    if root is None:
-        say("no photographs (--root SCENE): the procedural scene alone")
-    else:
-        photographs = ("data=colmap", f"data.root={root}", f"data.resize={resize}")
+def scene_overrides(
+    root: Path | None,
+    resize: float,
+    quick: bool,
+    synthetic: bool = True,
+    further: Sequence[str] = (),
+) -> dict[str, tuple[str, ...]]:
+    """What `python -m vlgs.run` is told of each scene: the procedural one, and the photographs at `root` where one is given.
+
+    Args:
+        root: A scene of `data=colmap`.
+        resize: Of the photographs.
+        quick: Small and short.
+        synthetic: Whether the procedural scene is among them.
+        further: Overrides for the photographs: where their language maps are, how they are asked.
+
+    Raises:
+        ValueError: If there is no scene, or overrides for photographs that are not there.
+    """
+    scenes: dict[str, tuple[str, ...]] = {}
+    if synthetic:
+        scenes["synthetic"] = QUICK if quick else ()
+    if root is not None:
+        photographs = ("data=colmap", f"data.root={root}", f"data.resize={resize}", *further)
         scenes["photographs"] = (*photographs, *(QUICK[-1:] if quick else ()))
+    elif further or not synthetic:
+        asked = " ".join(further) or "--no-synthetic"
+        raise ValueError(f"bench: {asked} must come with --root SCENE, got none")
+    else:
+        say("no photographs (--root SCENE): the procedural scene alone")
     return scenes
 
 

@@ -163,6 +163,29 @@ def _kernel_camera(camera: Camera, config: RasterConfig) -> _csrc.Camera:
     return _csrc.Camera(viewmat, [fx, fy, cx, cy], slopes, config.near, config.eps2d)
 
 
+class Work(NamedTuple):
+    """How much a forward pass had to do."""
+
+    entries: int
+    """Of all tile lists: (Gaussian, tile) pairs."""
+    weighed: int
+    """(Gaussian, 4x4 block of pixels, chain of transmittance) triples whose weights were formed."""
+
+
+def count_work(
+    splats: Splats, groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
+) -> Work:
+    """Blend once more and count; for benchmarks.
+
+    Raises:
+        ValueError: With ``stop="before"``, which leaves no trace of where a block ended.
+    """
+    layout, weights = _lay_out(groups, camera, config)
+    values = [groups[i].values for i in layout.order]
+    with torch.no_grad():
+        return Work(*_blend(layout, True, *splats, *weights, *values)[0].work())
+
+
 def freeze(
     splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig
 ) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, Tensor]:

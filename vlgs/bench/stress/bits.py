@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from vlgs import _csrc
-from vlgs.bench.stress.case import Case, Verdict
+from vlgs.bench.stress.case import CannotRunError, Case, Verdict
 from vlgs.bench.stress.splats import make_splats, render_with_gradients, tensors_of
 from vlgs.bench.stress.training import make_module, train
 
@@ -81,7 +81,7 @@ def on(isa: str) -> Callable[[bool], Verdict]:
         digests = measure(full) if isa == _csrc.isa() else _in_process(isa, full)
         (found,) = digests.pop("isa")
         if found != isa:
-            return Verdict(f"not run: this machine has {found} at best", True)
+            raise CannotRunError(f"this machine has {found} at best")
         parts = [f"{len(set(runs))} of {len(runs)} {what}" for what, runs in digests.items()]
         passed = all(len(set(runs)) == 1 for runs in digests.values())
         return Verdict(f"different results: {', '.join(parts)}", passed)

@@ -10,6 +10,10 @@ import torch
 from torch import Tensor
 
 
+class CannotRunError(Exception):
+    """This machine lacks what the case needs; says what."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What a case measured."""
@@ -25,7 +29,7 @@ class Case:
     name: str
     """Number in the list of known failures and a word: ``N4 needles``."""
     run: Callable[[bool], Verdict]
-    """Takes whether the case is run at full size, as the command does, or small, as the tests do."""
+    """Takes whether the case is run at full size, as the command does, or small, as the tests do. May raise `CannotRunError`."""
     minutes: int = 0
     """About how long it takes one core at full size; the long ones run last."""
 

@@ -11,8 +11,10 @@ from rich.table import Table
 
 from vlgs import _csrc
 from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
-from vlgs.bench.stress.case import Case, Verdict
+from vlgs.bench.stress.case import CannotRunError, Case
 from vlgs.report.provenance import commit, same_code
+
+PASSED, FAILED, NOT_RUN = "passed", "FAILED", "not run"
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,8 @@ class StressRow:
     case: str
     criterion: str
     measured: str
-    passed: bool
+    outcome: str
+    """`PASSED`, `FAILED`, or `NOT_RUN` where this machine cannot run it."""
     seconds: float
     """Wall clock."""
     cpu_seconds: float
@@ -33,14 +36,17 @@ class StressRow:
 
 
 def run_case(case: Case, full: bool) -> StressRow:
-    """Run one; an exception is a failure."""
+    """Run one; an exception is a failure, unless it says that the machine cannot run the case."""
     wall, cpu = time.perf_counter(), sum(os.times()[:4])
     try:
         verdict = case.run(full)
+        measured, outcome = verdict.measured, PASSED if verdict.passed else FAILED
+    except CannotRunError as error:
+        measured, outcome = str(error), NOT_RUN
     except Exception as error:
-        verdict = Verdict(f"{type(error).__name__}: {error}", False)
+        measured, outcome = f"{type(error).__name__}: {error}", FAILED
     return StressRow(
-        case.name, case.criterion, verdict.measured, verdict.passed,
+        case.name, case.criterion, measured, outcome,
         round(time.perf_counter() - wall, 1), round(sum(os.times()[:4]) - cpu, 1), _csrc.isa(), commit(),
     )  # fmt: skip
 
@@ -65,7 +71,8 @@ def run_cases(cases: Sequence[Case], full: bool, path: Path | None) -> list[Stre
             say(f"{case.name}: is there")
             continue
         row = done[case.name] = run_case(case, full)
-        say(f"{row.case}: {'passed' if row.passed else 'FAILED'} in {row.seconds:.1f} s")
+        how = f", {row.measured}" if row.outcome == NOT_RUN else f" in {row.seconds:.1f} s"
+        say(f"{row.case}: {row.outcome}{how}")
         if path is not None:
             # Rows of cases yet to come stay out: they are of other code.
             write_sheet(path, [done[c.name] for c in cases if c.name in done], header)
@@ -88,7 +95,7 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
     return {
         row.case: row
         for row in rows
-        if row.passed
+        if row.outcome == PASSED
         and row.isa == isa
         and isinstance(row.commit, str)
         and same_code(row.commit, here)
@@ -96,11 +103,16 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
 
 
 def show_table(rows: Sequence[StressRow]) -> Table:
-    """Case, criterion, what was measured, whether it passed."""
+    """Case, criterion, what was measured, how it came out; and how many were not run."""
     table = Table(title=f"vlgs stress, {_csrc.isa()}", show_lines=True)
-    for name in ("case", "criterion", "measured", "passed"):
+    for name in ("case", "criterion", "measured", "outcome"):
         table.add_column(name)
     for row in rows:
-        passed = "yes" if row.passed else "[red]NO[/red]"
-        table.add_row(row.case, row.criterion, row.measured, passed)
+        color = {PASSED: "default", FAILED: "red", NOT_RUN: "yellow"}[row.outcome]
+        table.add_row(row.case, row.criterion, row.measured, f"[{color}]{row.outcome}[/]")
+    missing = [row.case for row in rows if row.outcome == NOT_RUN]
+    if missing:
+        table.caption = (
+            f"not run on this machine: {len(missing)} of {len(rows)} ({'; '.join(missing)})"
+        )
     return table

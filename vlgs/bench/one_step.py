@@ -1,0 +1,131 @@
+"""One training step with a switch of `vlgs.skips` turned, which can be taken again and again: it ends before Adam."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from copy import deepcopy
+from dataclasses import dataclass, fields, replace
+from time import perf_counter, process_time
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+from torch import Tensor
+
+from vlgs.bench.clock import Pass
+from vlgs.bench.outcome import Outcome
+from vlgs.fusion.none import NoFusion
+from vlgs.module.blended import BlendPlan
+from vlgs.module.lightning import VLGSModule
+from vlgs.module.settings import SkipConfig
+from vlgs.module.state import capture, restore
+from vlgs.skips import SKIPS, Skip
+
+FROZEN = ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits", "indicator_logits")
+"""What is frozen on both sides of ``frozen_weights``: all but language."""
+
+
+@dataclass(frozen=True)
+class StepSwitch:
+    """A skip whose setting is a field of `SkipConfig`."""
+
+    skip: Skip
+    field: str
+
+    def setting(self, on: bool) -> dict[str, Any]:
+        """The field and its value."""
+        return {self.field: self.skip.on if on else self.skip.off}
+
+
+class Step(NamedTuple):
+    """What a step came to."""
+
+    loss: float
+    outcome: Outcome
+    """Images of the real views, gradients of all parameters."""
+    blended: float | None
+    """Mean squared error of the blended view; None where none was rendered or the view does not count."""
+
+
+def step_switches() -> list[StepSwitch]:
+    """In the order of `SKIPS`."""
+    names = {field.name for field in fields(SkipConfig)}
+    switches = []
+    for skip in SKIPS:
+        group, _, field = skip.setting.rpartition(".")
+        if group == "trainer.skip" and field in names:
+            switches.append(StepSwitch(skip, field))
+    return switches
+
+
+def turned(module: VLGSModule, switch: StepSwitch, on: bool) -> VLGSModule:
+    """A module of its own in the same state, with the switch turned.
+
+    ``frozen_weights`` is for language on finished geometry: on both sides everything else is frozen, and nothing fused.
+    """
+    freeze, config = module.settings.freeze, module.gaussians_config
+    if switch.field == "frozen_weights":
+        own = [name for name in module.model.splats if name.startswith("language_")]
+        freeze = [*FROZEN, *own]
+        config = replace(config, densify=replace(config.densify, stop=0))
+    skip = replace(module.settings.skip, **switch.setting(on))
+    settings = replace(module.settings, freeze=freeze, skip=skip)
+    made = VLGSModule(
+        deepcopy(module.model), module.scene, module.blend, module.losses, config, settings,
+        module.seed, module.color,
+    )  # fmt: skip
+    restore(made, capture(module, {}))
+    if switch.field == "frozen_weights":
+        made.model.fusion = NoFusion()
+    made.skips.restore({})
+    made.skips.similarities = module.skips.similarities  # constants of the scene
+    return made
+
+
+def run_step(module: VLGSModule, step: int) -> Pass:
+    """One training step up to Adam, which does not follow: time forward, and backward until Adam would begin."""
+    marks: list[tuple[float, float]] = []
+
+    def mark() -> None:
+        marks.append((perf_counter(), process_time()))
+
+    def backward(*args: Any) -> Any:
+        mark()
+        return right(*args)
+
+    right, next_step = module._backward, module.next_step
+    with ExitStack() as patches:
+        patches.enter_context(patch.object(module, "_backward", backward))
+        patches.enter_context(patch.object(module.optimizer, "step", mark))
+        mark()
+        module.training_step(step, 0)
+    module.next_step = next_step
+    # Without a backward pass where nothing that is trained is in view.
+    start, middle, end = marks if len(marks) == 3 else (*marks, marks[-1])
+    ways = ((start, middle), (middle, end))
+    return Pass(*(1e3 * (b - a) for way in ways for a, b in zip(*way, strict=True)))
+
+
+def run_steps(module: VLGSModule, steps: Sequence[int]) -> Pass:
+    """Several steps from the one state; the mean of each time."""
+    passes = [run_step(module, step) for step in steps]
+    return Pass(*(sum(times) / len(passes) for times in zip(*passes, strict=True)))
+
+
+def measure_step(module: VLGSModule, step: int) -> Step:
+    """What the step comes to; its numbers are copies."""
+    blended: list[float] = []
+    right = module._blended_loss
+
+    def watched(plan: BlendPlan, *args: Any) -> Tensor:
+        loss = right(plan, *args)
+        if plan.weight > 0:
+            blended.append(loss.item() / plan.weight)
+        return loss
+
+    with patch.object(module, "_blended_loss", watched):
+        run_step(module, step)
+    images = [i for r in module.report.renders for i in (r.color, r.feature) if i is not None]
+    gradients = {
+        name: p.grad.double() for name, p in module.model.named_parameters() if p.grad is not None
+    }
+    outcome = Outcome(tuple(image.detach().double() for image in images), gradients)
+    return Step(module.report.loss, outcome, blended[0] if blended else None)
