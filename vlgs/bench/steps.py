@@ -195,8 +195,10 @@ class _Pair:
 
 
 def _plan(module: VLGSModule, step: int) -> BlendPlan | None:
-    first, second = (module.target(i) for i in module.sampler.pair(step))
-    return None if first is second else module._plan_blend(step, first, second)
+    pair = module.sampler.pair(step)
+    if pair[0] == pair[1]:
+        return None
+    return module._plan_blend(step, *(module.target(index) for index in pair))
 
 
 def _detour(used: Camera, meant: Camera, first: Camera, second: Camera) -> float:
