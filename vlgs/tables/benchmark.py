@@ -122,9 +122,15 @@ class Composer:
         words = [*self.benchmark.overrides, *overrides]
         key = hashlib.sha256("\0".join([self._tree, *words]).encode()).hexdigest()
         if key not in self._known:
-            found = identity(_compose(words))
-            self._known[key] = {"recipe": found.recipe, "data": found.data}
-        return Identity(**self._known[key], seed=seed)
+            try:
+                found = identity(_compose(words))
+                self._known[key] = {"recipe": found.recipe, "data": found.data}
+            except UnknownOptionError as error:
+                self._known[key] = {"refused": str(error)}
+        known = self._known[key]
+        if "refused" in known:
+            raise UnknownOptionError(known["refused"])
+        return Identity(**known, seed=seed)
 
     def takes_scenes(self) -> bool:
         """Whether a run is told its scene (`data.scene`), or `data.root` is the scene."""

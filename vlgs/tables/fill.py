@@ -10,7 +10,7 @@ import pandas as pd
 from vlgs.config import split_override
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.quantities import QUANTITIES
-from vlgs.tables.registry import AVERAGE, Row, Table
+from vlgs.tables.registry import AVERAGE, Table
 
 CELL_COLUMNS = (
     "row",
@@ -65,13 +65,19 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
         ValueError: If a row names an option that does not exist.
     """
     entries = {QUANTITIES[name].entry for name in table.metrics}
-    frame = frame[frame["metric"].isin({"per_category"} if table.by_category else entries)]
+    frame = frame[
+        frame["metric"].isin({"per_category"} if table.by_category else entries)
+        & frame["scene"].isin(benchmark.scenes)
+        & frame["seed"].isin(benchmark.seeds)
+    ]
+    places = frame.groupby(["recipe", "data_recipe"]).indices
     values, hashes, recipes = [], set[str](), dict[int, str]()
     for index, row in enumerate(table.rows):
         if row.overrides is None:
             continue
-        recipes[index] = composer.identity(row.overrides, benchmark.seeds[0]).recipe
-        found = _runs_of(row, benchmark, composer, frame)
+        wanted = composer.identity(row.overrides, benchmark.seeds[0])
+        recipes[index] = wanted.recipe
+        found = frame.iloc[places.get((wanted.recipe, wanted.data), [])]
         hashes |= set(found["config_hash"])
         values.append(_values(index, table, found, several=len(benchmark.scenes) > 1))
     long = pd.concat(values) if values else _values(0, table, frame.iloc[:0], several=False)
@@ -89,19 +95,6 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
     kinds = {c: k for c, k in columns.items() if k}
     long = long.reset_index(drop=True)
     return Filled(table, benchmark, tuple(columns), kinds, recipes, same, cells, long, runs)
-
-
-def _runs_of(
-    row: Row, benchmark: Benchmark, composer: Composer, frame: pd.DataFrame
-) -> pd.DataFrame:
-    assert row.overrides is not None
-    wanted = composer.identity(row.overrides, benchmark.seeds[0])
-    return frame[
-        (frame["recipe"] == wanted.recipe)
-        & (frame["data_recipe"] == wanted.data)
-        & frame["scene"].isin(benchmark.scenes)
-        & frame["seed"].isin(benchmark.seeds)
-    ]
 
 
 def _values(index: int, table: Table, found: pd.DataFrame, several: bool) -> pd.DataFrame:
