@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from time import thread_time
+from time import sleep, thread_time
 from typing import NamedTuple
 
 import torch
@@ -22,6 +22,8 @@ from vlgs.types import RasterConfig
 ISAS = ("v4", "v3", "base")
 """Instruction sets of the kernel, best first: AVX-512, AVX2, baseline."""
 
+SETTLE_SECONDS = 0.05
+"""Between two turns: OpenMP's threads of the process before go on spinning for a while, on a core that the next one needs."""
 REFERENCE_BYTES = 80
 """Memory of the dense reference and its gradients per Gaussian, pixel and pair of groups, bytes: an estimate, not measured."""
 
@@ -210,6 +212,7 @@ def _elsewhere(size: Size, job: Job, rate: float) -> tuple[float | None, float |
 
 
 def _time_in(child: Child, job: Job, seed: int) -> Pass:
+    sleep(SETTLE_SECONDS)
     return child.call(time_job, job, seed)
 
 
