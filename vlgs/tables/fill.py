@@ -12,6 +12,8 @@ from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE, Table
 
+LONG = {"row": int, "column": str, "kind": str, "metric": str, "seed": int, "value": float}
+"""Columns of `Filled.values`."""
 CELL_COLUMNS = (
     "row",
     "group",
@@ -79,8 +81,8 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
         recipes[index] = wanted.recipe
         found = frame.iloc[places.get((wanted.recipe, wanted.data), [])]
         hashes |= set(found["config_hash"])
-        values.append(_values(index, table, found, several=len(benchmark.scenes) > 1))
-    long = pd.concat(values) if values else _values(0, table, frame.iloc[:0], several=False)
+        values.extend(_values(index, table, found, several=len(benchmark.scenes) > 1))
+    long = pd.DataFrame(values, columns=list(LONG)).astype(LONG)
     if table.by_category:
         long = pd.concat([long, _kind_means(long)])
         columns = _category_columns(table, long)
@@ -97,29 +99,28 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
     return Filled(table, benchmark, tuple(columns), kinds, recipes, same, cells, long, runs)
 
 
-def _values(index: int, table: Table, found: pd.DataFrame, several: bool) -> pd.DataFrame:
-    """Numbers of one row in printed units; categories of several scenes carry the scene's name."""
-    parts = []
+def _values(
+    index: int, table: Table, found: pd.DataFrame, several: bool
+) -> Iterator[tuple[int, str, str, str, int, float]]:
+    """Numbers of one row in printed units, as `LONG`; categories of several scenes carry the scene's name.
+
+    Plain loops: of frames this small pandas would take most of the time that all tables take.
+    """
+    only = set(table.kinds.values())
+    names = ("scene", "category", "kind", "metric", "seed", "value")
+    numbers = list(zip(*(found[name].tolist() for name in names), strict=True))
     for name in table.metrics:
         quantity = QUANTITIES[name]
-        rows = found[found["metric"] == ("per_category" if table.by_category else quantity.entry)]
-        column, kind = rows["scene"], rows["kind"]
-        if table.by_category:
-            column = rows["category"]
-            kind = kind.where(kind != "", column.map(printed_name).map(table.kinds).fillna(""))
-            column = rows["scene"] + ": " + column if several else column
-        part = {
-            "row": index,
-            "column": column,
-            "kind": kind,
-            "metric": name,
-            "seed": rows["seed"],
-            "value": rows["value"] * quantity.factor,
-        }
-        parts.append(pd.DataFrame(part).dropna(subset=["value"]))
-    long = pd.concat(parts)
-    only = set(table.kinds.values())
-    return long[long["kind"].isin(only)] if len(only) == 1 else long
+        entry = "per_category" if table.by_category else quantity.entry
+        for scene, category, kind, metric, seed, value in numbers:
+            if metric != entry or math.isnan(value):
+                continue
+            column = scene
+            if table.by_category:
+                kind = kind or table.kinds.get(printed_name(category), "")
+                column = f"{scene}: {category}" if several else category
+            if len(only) != 1 or kind in only:
+                yield index, column, kind, name, seed, value * quantity.factor
 
 
 def printed_name(category: str) -> str:
