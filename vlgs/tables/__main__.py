@@ -9,6 +9,7 @@ Writes results/runs.csv (one row per run, metric and category; runs.parquet with
 .tex, and tables.tex over all of them. Nothing is trained, and nothing that has no run is filled in.
 """
 
+import gc
 import sys
 from pathlib import Path
 
@@ -38,4 +39,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    gc.disable()  # two seconds that keep nearly all they make: looking for garbage takes a sixth of them
     main()
