@@ -1,5 +1,7 @@
 #include "window.h"
 
+#include <type_traits>
+
 #include "isa.h"
 
 namespace vlgs::VLGS_ISA_NS {
@@ -41,6 +43,16 @@ void along(const T *line, const T *given, int64_t width, T *__restrict out) {
   }
 }
 
+// Of one channel of a row. The step is a constant where it can be: GCC then vectorises the loop.
+template <class T, class Step>
+void moments(const T *a, const T *b, Step step, int64_t width, T *__restrict p, T *__restrict q,
+             T *__restrict pp, T *__restrict qq) {
+  for (int64_t x = 0; x < width; ++x) {
+    const T total = a[x * step] + b[x * step], gap = a[x * step] - b[x * step];
+    p[x] = total, q[x] = gap, pp[x] = total * total, qq[x] = gap * gap;
+  }
+}
+
 }  // namespace
 
 int64_t window_scratch(int64_t width) { return 2 * width + kTaps; }
@@ -74,11 +86,11 @@ void similarity_plane(const Similarity<T> &s, int64_t channel, T *scratch) {
   };
   const auto read = [&](int64_t y) {
     const T *a = s.a + y * w * s.channels + channel, *b = s.b + y * w * s.channels + channel;
-    T *const p = row_of(0, y), *const q = row_of(1, y), *const pp = row_of(2, y), *const qq = row_of(3, y);
-    for (int64_t x = 0; x < w; ++x) {
-      const T total = a[x * s.channels] + b[x * s.channels], gap = a[x * s.channels] - b[x * s.channels];
-      p[x] = total, q[x] = gap, pp[x] = total * total, qq[x] = gap * gap;
-    }
+    T *const rows[kMoments] = {row_of(0, y), row_of(1, y), row_of(2, y), row_of(3, y)};
+    if (s.channels == 3)
+      moments(a, b, std::integral_constant<int64_t, 3>(), w, rows[0], rows[1], rows[2], rows[3]);
+    else
+      moments(a, b, s.channels, w, rows[0], rows[1], rows[2], rows[3]);
   };
   for (int64_t y = 0; y < kHalf && y < s.height; ++y) read(y);
   for (int64_t y = 0; y < s.height; ++y) {

@@ -239,7 +239,7 @@ class _SquaredError(torch.autograd.Function):
     def backward(ctx: Any, d_loss: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         render, target, valid = ctx.saved_tensors
         d_render = torch.empty_like(render)
-        scale = 2 * (d_loss / ctx.numbers).item()
+        scale = 2 * d_loss.item() / ctx.numbers
         threads = torch.get_num_threads()
         _csrc.squared_error_backward(render, target, valid, scale, d_render, threads)
         return d_render, -d_render if ctx.needs_input_grad[1] else None, None, None

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -9,7 +10,6 @@ import lightning as L
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
 
 from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
@@ -334,17 +334,24 @@ class VLGSModule(L.LightningModule):
             errors.append((loss if known else masked_mse(render.color, target.image)).item())
         return fmean(errors) if errors else math.nan
 
+    def _trained(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """What the step can move, by name: not the codec, which is fitted before."""
+        for name, parameter in self.model.splats.items():
+            yield f"splats.{name}", parameter
+        if isinstance(self.model.fusion, nn.Module):
+            yield from self.model.fusion.named_parameters("fusion")
+
     def _refuse_non_finite(self, where: str) -> None:
         """Stop before Adam spreads one bad number over everything (pitfalls N1)."""
         looked_at: dict[str, Tensor] = {}
-        for name, parameter in self.model.named_parameters():
+        for name, parameter in self._trained():
             if parameter.grad is not None:
                 looked_at[f"gradient of {name}"] = parameter.grad
             # Others are looked at where they are read; these come to a finite weight or scale, with no gradient, at infinity.
             if name.endswith(("_logits", "log_scales")):
                 looked_at[name] = parameter.detach()
-        # Finite only if every number is; the square of a large one can overflow, hence the search.
-        if torch.isfinite(get_total_norm(list(looked_at.values()))):
+        # Finite only if every number is; the sum of large ones can overflow, hence the search.
+        if all(math.isfinite(tensor.sum().item()) for tensor in looked_at.values()):
             return
         for name, tensor in looked_at.items():
             rows = ~torch.isfinite(tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None])

@@ -174,13 +174,17 @@ class SplatModel(nn.Module):
         """RGB of every Gaussian as a camera sees it, >= 0."""
         if self.evaluated:
             return self._fuse_as_seen(fused.gaussians, camera)[0]
-        gaussians, eye = fused.gaussians, camera_center(camera.viewmat)
+        gaussians, eye = fused.gaussians, self._eye(camera)
         return view_color(fused.color, gaussians.shN, gaussians.means, eye, self.sh_degree)
+
+    def _eye(self, camera: Camera) -> Float[Tensor, " 3"]:
+        """Where colour is seen from; of degree 0 it is the same from anywhere, and the centre is not looked for."""
+        return camera_center(camera.viewmat) if self.sh_degree else camera.viewmat.new_zeros(3)
 
     def _fuse_as_seen(
         self, gaussians: Gaussians, camera: Camera
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n d"]]:
-        eye, rgb = camera_center(camera.viewmat), sh_to_rgb(gaussians.sh0)
+        eye, rgb = self._eye(camera), sh_to_rgb(gaussians.sh0)
         seen = view_color(rgb, gaussians.shN, gaussians.means, eye, self.sh_degree)
         color, feature = self.fusion(seen, gaussians.features)
         return color.clamp_min(0.0), feature
