@@ -11,8 +11,8 @@ import pytest
 from tables_fakes import fake_runs
 
 from vlgs.tables.benchmark import Benchmark, Composer
-from vlgs.tables.fill import Filled, fill
-from vlgs.tables.frame import read_metrics, require_one_meaning, tidy
+from vlgs.tables.fill import Cell, Filled, Place, fill
+from vlgs.tables.frame import by_row, read_metrics, require_one_meaning, tidy, to_lines
 from vlgs.tables.grid import arrange
 from vlgs.tables.html import write_report
 from vlgs.tables.latex import escape, to_latex
@@ -48,35 +48,33 @@ def table(tmp_path: Path) -> Table:
 
 
 def filled_of(table: Table, results: Path, benchmark: Benchmark = BENCHMARK) -> Filled:
-    return fill(table, benchmark, Composer(benchmark), tidy(read_metrics(results)))
+    return fill(table, benchmark, Composer(benchmark), by_row(to_lines(read_metrics(results))))
 
 
-def cell(filled: Filled, row: int, column: str, metric: str = "miou") -> pd.Series:
-    cells = filled.cells
-    chosen = (cells["row"] == row) & (cells["column"] == column) & (cells["metric"] == metric)
-    return cells[chosen].iloc[0]
+def cell(filled: Filled, row: int, column: str, metric: str = "miou") -> Cell:
+    return filled.cells[Place(row, column, metric)]
 
 
 def test_means_and_deviations_are_those_of_the_runs(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     filled = filled_of(table, tmp_path)
     full = cell(filled, 1, "mirrors")
-    assert full["mean"] == pytest.approx(61.0)
-    assert full["std"] == pytest.approx(2 / 2**0.5)  # of 60 and 62, with n - 1
-    assert full["seeds"] == 2
+    assert full.mean == pytest.approx(61.0)
+    assert full.std == pytest.approx(2 / 2**0.5)  # of 60 and 62, with n - 1
+    assert full.seeds == 2
     average = cell(filled, 1, "avg")
-    assert average["mean"] == pytest.approx(56.0)
-    assert average["paper"] == 50.0
-    assert pd.isna(average["difference"])  # the scenes are not the paper's
-    assert cell(filled, 1, "glassware", "psnr")["mean"] == pytest.approx(30.51)
+    assert average.mean == pytest.approx(56.0)
+    assert average.paper == 50.0
+    assert pd.isna(average.difference)  # the scenes are not the paper's
+    assert cell(filled, 1, "glassware", "psnr").mean == pytest.approx(30.51)
 
 
 def test_a_missing_run_is_missing(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value, skip=[("Full", "mirrors", s) for s in (0, 1)])
     filled = filled_of(table, tmp_path)
-    assert pd.isna(cell(filled, 1, "mirrors")["mean"])
-    assert pd.isna(cell(filled, 1, "avg")["mean"])  # no average of half the scenes
-    assert cell(filled, 1, "glassware")["seeds"] == 2
+    assert pd.isna(cell(filled, 1, "mirrors").mean)
+    assert pd.isna(cell(filled, 1, "avg").mean)  # no average of half the scenes
+    assert cell(filled, 1, "glassware").seeds == 2
     latex = to_latex(filled)
     assert re.search(r"Full .*--", latex)
     assert "Someone" in latex
@@ -89,7 +87,7 @@ def test_paper_values_and_differences_on_the_papers_scenes(table: Table, tmp_pat
     fake_runs(tmp_path, [ours], BENCHMARK, value)
     filled = filled_of(ours, tmp_path)
     assert filled.same_scenes
-    assert cell(filled, 1, "avg")["difference"] == pytest.approx(6.0)
+    assert cell(filled, 1, "avg").difference == pytest.approx(6.0)
     assert "(50.0, +6.0)" in to_latex(filled)
 
 
@@ -151,9 +149,10 @@ def test_every_table_of_the_registry_is_well_formed_without_a_run(label: str):
         for row in table.rows  # what they override is test_tables_registry's
     )
     table = Table(**{**vars(table), "rows": rows})
-    filled = fill(table, BENCHMARK, Composer(BENCHMARK), tidy([]))
+    filled = fill(table, BENCHMARK, Composer(BENCHMARK), {})
     balanced(to_latex(filled))
-    assert filled.cells["mean"].isna().all()
+    assert filled.cells
+    assert all(pd.isna(found.mean) for found in filled.cells.values())
     assert "No runs yet" in to_latex(filled)
 
 
@@ -220,16 +219,16 @@ def test_the_papers_categories_are_found_with_blanks(tmp_path: Path):
     table = load_table(path)
     fake_runs(tmp_path, [table], one, value)
     filled = filled_of(table, tmp_path, one)
-    assert cell(filled, 1, "big wall")["difference"] == pytest.approx(10.0)
+    assert cell(filled, 1, "big wall").difference == pytest.approx(10.0)
 
 
 def test_runs_that_must_not_stand_together_are_refused(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     runs = read_metrics(tmp_path)
     with pytest.raises(ValueError, match="must be one, got"):
-        require_one_meaning(tidy([*runs, runs[0] | {"config_hash": "twin"}]))
+        require_one_meaning(tidy(to_lines([*runs, runs[0] | {"config_hash": "twin"}])))
     with pytest.raises(ValueError, match=r"must share a protocol, got dense@1/synthetic, dense@2"):
-        require_one_meaning(tidy([*runs[1:], runs[0] | {"protocol": "dense@2"}]))
+        require_one_meaning(tidy(to_lines([*runs[1:], runs[0] | {"protocol": "dense@2"}])))
     (tmp_path / "runs" / "broken").mkdir()
     (tmp_path / "runs" / "broken" / "metrics.json").write_text("{")
     with pytest.raises(ValueError, match=r"broken.metrics\.json: must be JSON"):
@@ -270,7 +269,7 @@ def test_the_report_has_its_pictures(table: Table, tmp_path: Path):
     folder = tmp_path / "synthetic"
     folder.mkdir()
     write_tables(folder, [filled])
-    write_report(folder, [filled], tidy(read_metrics(tmp_path)), tmp_path)
+    write_report(folder, [filled], tidy(to_lines(read_metrics(tmp_path))), tmp_path)
     text = (folder / "index.html").read_text()
     named = re.findall(r'(?:src|href)="([^"#]+)"', text)
     assert {"plots/tiny.png", "plots/time.png", "plots/curves.png", "plots/indicator.png"} <= set(
@@ -297,6 +296,31 @@ def test_all_formats_say_where_the_numbers_come_from(table: Table, tmp_path: Pat
     assert len(frame["config_hash"].unique()) == 12
     pytest.importorskip("pyarrow")
     assert len(pd.read_parquet(tmp_path / "runs.parquet")) == len(frame)
+
+
+def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Path):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    write_all(tmp_path, [table], html=True)
+    files = [tmp_path / "runs.csv", *sorted((tmp_path / "synthetic").glob("tiny.*"))]
+    before = [file.read_bytes() for file in files]
+    assert len(files) == 4
+    shutil.rmtree(tmp_path / "runs")
+    for file in files[1:]:
+        file.unlink()
+    write_all(tmp_path, [table], html=True)
+    assert [file.read_bytes() for file in files] == before
+
+    files[0].write_text("config_hash,value\na,1\n")
+    with pytest.raises(ValueError, match=r"runs.csv: must be as vlgs.tables writes it"):
+        write_all(tmp_path, [table])
+    files[0].write_bytes(before[0].replace(b",0,dense@1", b",first,dense@1"))
+    with pytest.raises(ValueError, match=r"runs.csv: must be as .*first"):
+        write_all(tmp_path, [table])
+    files[0].unlink()
+    with pytest.raises(ValueError, match="must hold finished runs"):
+        write_all(tmp_path, [table])
+    assert [file.read_bytes() for file in files[1:]] == before[1:]
 
 
 def test_tables_without_torch_on_400_runs(tmp_path: Path):

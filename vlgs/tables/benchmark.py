@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,6 +112,7 @@ class Composer:
         self.benchmark = benchmark
         self._cache = cache
         self._known = _read_cache(cache)
+        self._composed = False
         self._tree = _tree_digest()
 
     def identity(self, overrides: Sequence[str], seed: int) -> Identity:
@@ -122,6 +124,12 @@ class Composer:
         words = [*self.benchmark.overrides, *overrides]
         key = hashlib.sha256("\0".join([self._tree, *words]).encode()).hexdigest()
         if key not in self._known:
+            if self._cache is not None and not self._composed:
+                print(
+                    f"composing the rows of {self.benchmark.name}, once per change of conf",
+                    file=sys.stderr,
+                )
+            self._composed = True
             try:
                 found = identity(_compose(words))
                 self._known[key] = {"recipe": found.recipe, "data": found.data}

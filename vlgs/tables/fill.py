@@ -1,35 +1,54 @@
-"""From runs to the numbers of one table: mean and deviation over seeds beside the paper's value."""
+"""From runs to the numbers of one table: mean and deviation over seeds beside the paper's value.
+
+Plain loops: of frames as small as one table's, pandas would take most of the time that all tables take.
+"""
 
 import math
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-
-import pandas as pd
+from typing import NamedTuple
 
 from vlgs.config import split_override
 from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.frame import Line, Lines
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE, Table
 
-LONG = {"row": int, "column": str, "kind": str, "metric": str, "seed": int, "value": float}
-"""Columns of `Filled.values`."""
-CELL_COLUMNS = (
-    "row",
-    "group",
-    "label",
-    "column",
-    "metric",
-    "mean",
-    "std",
-    "seeds",
-    "paper",
-    "difference",
-)
-
-
 MEAN = "mean of "
 """Before the kind, in the column of the mean over the categories of a kind."""
+
+
+class Number(NamedTuple):
+    """One number of one run, in printed units; never NaN."""
+
+    row: int
+    column: str
+    kind: str
+    """Of a category, "" otherwise."""
+    metric: str
+    seed: int
+    value: float
+
+
+class Place(NamedTuple):
+    """Where a cell stands."""
+
+    row: int
+    column: str
+    metric: str
+
+
+class Cell(NamedTuple):
+    """What stands there, in printed units; NaN where there is nothing."""
+
+    mean: float
+    std: float
+    """Over seeds, with n - 1."""
+    seeds: int
+    paper: float
+    difference: float
+    """Mean minus the paper's, where the scenes are the paper's."""
 
 
 @dataclass(frozen=True)
@@ -46,81 +65,67 @@ class Filled:
     """Row -> recipe of its runs, for rows that can be run."""
     same_scenes: bool
     """Whether the scenes are the paper's, so that its values can be set against ours."""
-    cells: pd.DataFrame
-    """`CELL_COLUMNS`, in printed units; no value is NaN. ``std`` is over seeds, with n - 1."""
-    values: pd.DataFrame
-    """Every single number behind the cells: row, column, kind, metric, seed, value."""
-    runs: pd.DataFrame
-    """The runs behind the cells, one line each: config_hash, protocol, commit, cpu, results_version."""
+    cells: Mapping[Place, Cell]
+    """Every place of the table, row by row."""
+    numbers: Sequence[Number]
+    """Every single number behind the cells."""
+    runs: Sequence[Line]
+    """The runs behind the cells: a line of each, whichever."""
+    provenance: tuple[str, ...]
+    """Machine, commit, protocol, seeds and data of those runs, as text."""
 
 
-def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataFrame) -> Filled:
+def fill(table: Table, benchmark: Benchmark, composer: Composer, lines: Lines) -> Filled:
     """Look up the runs of every row.
 
     Args:
         table: What to fill.
         benchmark: Data, scenes and seeds.
         composer: Of the same benchmark.
-        frame: As `vlgs.tables.frame.tidy` returns it.
+        lines: Of all runs.
 
     Raises:
         ValueError: If a row names an option that does not exist.
     """
     entries = {QUANTITIES[name].entry for name in table.metrics}
-    frame = frame[
-        frame["metric"].isin({"per_category"} if table.by_category else entries)
-        & frame["scene"].isin(benchmark.scenes)
-        & frame["seed"].isin(benchmark.seeds)
-    ]
-    places = frame.groupby(["recipe", "data_recipe"]).indices
-    values, hashes, recipes = [], set[str](), dict[int, str]()
+    entries = {"per_category"} if table.by_category else entries
+    scenes, seeds = set(benchmark.scenes), set(benchmark.seeds)
+    numbers: list[Number] = []
+    runs: dict[str, Line] = {}
+    recipes: dict[int, str] = {}
     for index, row in enumerate(table.rows):
         if row.overrides is None:
             continue
         wanted = composer.identity(row.overrides, benchmark.seeds[0])
         recipes[index] = wanted.recipe
-        found = frame.iloc[places.get((wanted.recipe, wanted.data), [])]
-        hashes |= set(found["config_hash"])
-        values.extend(_values(index, table, found, several=len(benchmark.scenes) > 1))
-    long = pd.DataFrame(values, columns=list(LONG)).astype(LONG)
+        found = [
+            line
+            for line in lines.get((wanted.recipe, wanted.data), ())
+            if line.metric in entries and line.scene in scenes and line.seed in seeds
+        ]
+        runs |= {line.config_hash: line for line in found}
+        numbers.extend(_numbers(index, table, found, several=len(scenes) > 1))
     if table.by_category:
-        long = pd.concat([long, _kind_means(long)])
-        columns = _category_columns(table, long)
+        numbers.extend(_kind_means(numbers))
+        columns = _category_columns(table, numbers)
     else:
-        long = pd.concat([long, _averages(long, benchmark.scenes)])
-        several = len(benchmark.scenes) > 1
-        columns = dict.fromkeys((*benchmark.scenes, AVERAGE) if several else benchmark.scenes, "")
+        numbers.extend(_averages(numbers, benchmark.scenes))
+        named = (*benchmark.scenes, AVERAGE) if len(scenes) > 1 else benchmark.scenes
+        columns = dict.fromkeys(named, "")
     dataset = dict(map(split_override, benchmark.overrides)).get("data", "synthetic")
-    same = dataset == table.dataset and set(benchmark.scenes) <= set(table.scenes.values())
-    cells = pd.DataFrame(_cells(table, tuple(columns), long, same), columns=pd.Index(CELL_COLUMNS))
-    runs = frame[frame["config_hash"].isin(hashes)].drop_duplicates("config_hash")
-    kinds = {c: k for c, k in columns.items() if k}
-    long = long.reset_index(drop=True)
-    return Filled(table, benchmark, tuple(columns), kinds, recipes, same, cells, long, runs)
-
-
-def _values(
-    index: int, table: Table, found: pd.DataFrame, several: bool
-) -> Iterator[tuple[int, str, str, str, int, float]]:
-    """Numbers of one row in printed units, as `LONG`; categories of several scenes carry the scene's name.
-
-    Plain loops: of frames this small pandas would take most of the time that all tables take.
-    """
-    only = set(table.kinds.values())
-    names = ("scene", "category", "kind", "metric", "seed", "value")
-    numbers = list(zip(*(found[name].tolist() for name in names), strict=True))
-    for name in table.metrics:
-        quantity = QUANTITIES[name]
-        entry = "per_category" if table.by_category else quantity.entry
-        for scene, category, kind, metric, seed, value in numbers:
-            if metric != entry or math.isnan(value):
-                continue
-            column = scene
-            if table.by_category:
-                kind = kind or table.kinds.get(printed_name(category), "")
-                column = f"{scene}: {category}" if several else category
-            if len(only) != 1 or kind in only:
-                yield index, column, kind, name, seed, value * quantity.factor
+    same = dataset == table.dataset and scenes <= set(table.scenes.values())
+    return Filled(
+        table=table,
+        benchmark=benchmark,
+        columns=tuple(columns),
+        kinds={column: kind for column, kind in columns.items() if kind},
+        recipes=recipes,
+        same_scenes=same,
+        cells=dict(_cells(table, tuple(columns), numbers, same)),
+        numbers=numbers,
+        runs=tuple(runs.values()),
+        provenance=_provenance(benchmark, runs.values()),
+    )
 
 
 def printed_name(category: str) -> str:
@@ -133,46 +138,71 @@ def printed_name(category: str) -> str:
     return category.replace(" ", "_")
 
 
-def _kind_means(long: pd.DataFrame) -> pd.DataFrame:
+def _numbers(index: int, table: Table, found: Sequence[Line], several: bool) -> Iterator[Number]:
+    """Numbers of one row; categories of several scenes carry the scene's name."""
+    only = set(table.kinds.values())
+    for name in table.metrics:
+        quantity = QUANTITIES[name]
+        entry = "per_category" if table.by_category else quantity.entry
+        for line in found:
+            if line.metric != entry or math.isnan(line.value):
+                continue
+            column, kind = line.scene, line.kind
+            if table.by_category:
+                kind = kind or table.kinds.get(printed_name(line.category), "")
+                column = f"{line.scene}: {line.category}" if several else line.category
+            if len(only) != 1 or kind in only:
+                yield Number(index, column, kind, name, line.seed, line.value * quantity.factor)
+
+
+def _kind_means(numbers: Sequence[Number]) -> list[Number]:
     """Mean over the categories of a kind per seed, where every category has a number; kinds of one category have none."""
-    sizes = long.groupby("kind")["column"].nunique()
-    grouped = long.groupby(["row", "kind", "metric", "seed"])["value"]
-    means = grouped.agg(value="mean", size="count").reset_index()
-    needed = means["kind"].map(sizes)
-    means = means[(means["size"] == needed) & (needed > 1) & (means["kind"] != "")]
-    return means.drop(columns="size").assign(column=lambda part: MEAN + part["kind"])
+    columns: dict[str, set[str]] = {}
+    groups: dict[tuple[int, str, str, int], list[float]] = {}
+    for number in numbers:
+        columns.setdefault(number.kind, set()).add(number.column)
+        key = (number.row, number.kind, number.metric, number.seed)
+        groups.setdefault(key, []).append(number.value)
+    return [
+        Number(row, MEAN + kind, kind, metric, seed, statistics.fmean(values))
+        for (row, kind, metric, seed), values in groups.items()
+        if kind and len(values) == len(columns[kind]) > 1
+    ]
 
 
-def _category_columns(table: Table, long: pd.DataFrame) -> dict[str, str]:
+def _category_columns(table: Table, numbers: Sequence[Number]) -> dict[str, str]:
     """Category -> kind, kinds together and the mean of each last; the paper's categories where there is no run."""
-    if long.empty:
+    if not numbers:
         return dict(table.kinds)
-    pairs = set(zip(long["column"], long["kind"], strict=True))
-    ordered = sorted(pairs, key=lambda pair: (pair[1], pair[0].startswith(MEAN), pair[0]))
-    return dict(ordered)
+    pairs = {(number.column, number.kind) for number in numbers}
+    return dict(sorted(pairs, key=lambda pair: (pair[1], pair[0].startswith(MEAN), pair[0])))
 
 
-def _averages(long: pd.DataFrame, scenes: Sequence[str]) -> pd.DataFrame:
+def _averages(numbers: Sequence[Number], scenes: Sequence[str]) -> list[Number]:
     """Mean over scenes per seed, where every scene has a number."""
-    grouped = long.groupby(["row", "metric", "seed"])["value"]
-    averages = grouped.agg(value="mean", scenes="count").reset_index()
-    complete = averages[averages["scenes"] == len(scenes)].drop(columns="scenes")
-    return complete.assign(column=AVERAGE)
+    groups: dict[tuple[int, str, int], list[float]] = {}
+    for number in numbers:
+        groups.setdefault((number.row, number.metric, number.seed), []).append(number.value)
+    return [
+        Number(row, AVERAGE, "", metric, seed, statistics.fmean(values))
+        for (row, metric, seed), values in groups.items()
+        if len(values) == len(scenes)
+    ]
 
 
 def _cells(
-    table: Table, columns: Sequence[str], long: pd.DataFrame, same: bool
-) -> Iterator[tuple[object, ...]]:
+    table: Table, columns: Sequence[str], numbers: Sequence[Number], same: bool
+) -> Iterator[tuple[Place, Cell]]:
     names = {scene: paper for paper, scene in table.scenes.items()} | {AVERAGE: AVERAGE}
-    groups: dict[tuple[int, str, str], list[float]] = {}
-    for *key, value in zip(long["row"], long["column"], long["metric"], long["value"], strict=True):
-        groups.setdefault((key[0], key[1], key[2]), []).append(value)
+    groups: dict[Place, list[float]] = {}
+    for number in numbers:
+        place = Place(number.row, number.column, number.metric)
+        groups.setdefault(place, []).append(number.value)
     for index, row in enumerate(table.rows):
         for column in columns:
             for metric in table.metrics:
-                numbers = groups.get((index, column, metric), [])
-                mean = statistics.fmean(numbers) if numbers else math.nan
-                std = statistics.stdev(numbers) if len(numbers) > 1 else math.nan
+                place = Place(index, column, metric)
+                mean, std, seeds = _spread(groups.get(place, []))
                 paper = math.nan
                 if same:
                     printed = printed_name(column) if table.by_category else names.get(column, "")
@@ -180,6 +210,30 @@ def _cells(
                 elif column == AVERAGE:
                     paper = row.paper.get(AVERAGE, {}).get(metric, math.nan)
                 difference = mean - paper if same else math.nan
-                yield (
-                    index, row.group, row.label, column, metric, mean, std, len(numbers), paper, difference,
-                )  # fmt: skip
+                yield place, Cell(mean, std, seeds, paper, difference)
+
+
+def _spread(values: Sequence[float]) -> tuple[float, float, int]:
+    """Mean, deviation with n - 1, and how many."""
+    if not values:
+        return math.nan, math.nan, 0
+    mean = statistics.fmean(values)
+    if len(values) == 1:
+        return mean, math.nan, 1
+    squares = math.fsum((value - mean) ** 2 for value in values)
+    return mean, math.sqrt(squares / (len(values) - 1)), len(values)
+
+
+def _provenance(benchmark: Benchmark, runs: Collection[Line]) -> tuple[str, ...]:
+    def all_of(column: str) -> str:
+        return (
+            ", ".join(sorted({str(v) for r in runs if (v := getattr(r, column)) is not None}))
+            or "--"
+        )
+
+    return (
+        f"data: {' '.join(benchmark.overrides)}; scenes {', '.join(benchmark.scenes)}; "
+        f"seeds {', '.join(map(str, benchmark.seeds))}",
+        f"runs: {len(runs)}; protocol {all_of('protocol')}; results version {all_of('results_version')}",
+        f"commit: {all_of('commit')}; machine: {all_of('cpu')}",
+    )

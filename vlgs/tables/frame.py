@@ -1,28 +1,42 @@
-"""Finished runs as one tidy frame: a row per run, metric and category."""
+"""Finished runs as one tidy frame: a line per run, metric and category."""
 
+import csv
 import json
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
 from vlgs.files import write_atomically
 
-RUN_COLUMNS = (
-    "config_hash",
-    "recipe",
-    "data_recipe",
-    "dataset",
-    "scene",
-    "seed",
-    "protocol",
-    "results_version",
-    "commit",
-)
-"""What is the same in all rows of a run, as in metrics.json."""
 
-COLUMNS = (*RUN_COLUMNS, "cpu", "metric", "category", "kind", "value")
+class Line(NamedTuple):
+    """One number of a run; all but the last four are the same in all lines of a run, as in metrics.json."""
+
+    config_hash: str
+    recipe: str
+    data_recipe: str
+    dataset: str
+    scene: str
+    seed: int
+    protocol: str | None
+    results_version: int
+    commit: str | None
+    cpu: str | None
+    metric: str
+    category: str
+    """Of the metric ``per_category``, "" otherwise, as is `kind`."""
+    kind: str
+    value: float
+    """NaN where it could not be computed."""
+
+
+Lines = Mapping[tuple[str, str], Sequence[Line]]
+"""(recipe, data recipe) -> lines of its runs."""
+
+RUN_COLUMNS = Line._fields[: Line._fields.index("cpu")]
 
 DETAILS = {"per_category", "category_kinds", "indicator", "per_view", "reasons", "machine", "skips"}
 """Entries of metrics.json that are not one value."""
@@ -43,28 +57,74 @@ def read_metrics(results: Path) -> list[dict[str, Any]]:
     return runs
 
 
-def tidy(runs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row per run, metric and category; a metric that could not be computed has no value (NaN).
+def to_lines(runs: Iterable[Mapping[str, Any]]) -> list[Line]:
+    """Every number of every run.
 
     Args:
         runs: Contents of metrics.json files; those from before runs said which row they fill are left out.
     """
-    rows = []
+    lines = []
     for run in runs:
         if "recipe" not in run:
             continue
-        shared = [run.get(name) for name in RUN_COLUMNS] + [(run.get("machine") or {}).get("cpu")]
+        shared: dict[str, Any] = {name: run.get(name) for name in RUN_COLUMNS}
+        shared |= {"scene": str(run.get("scene")), "cpu": (run.get("machine") or {}).get("cpu")}
+        first = tuple(shared.values())
         for metric, value in run.items():
             if metric in RUN_COLUMNS or metric in DETAILS or isinstance(value, (str, dict, list)):
                 continue
-            rows.append([*shared, metric, "", "", value])
+            lines.append(Line._make((*first, metric, "", "", _number(value))))
         kinds = run.get("category_kinds") or {}
         for category, value in (run.get("per_category") or {}).items():
-            rows.append([*shared, "per_category", category, kinds.get(category, ""), value])
-    frame = pd.DataFrame(rows, columns=list(COLUMNS))
-    frame["value"] = pd.to_numeric(frame["value"], errors="coerce")
-    frame["scene"] = frame["scene"].astype(str)
-    return frame
+            kind = kinds.get(category, "")
+            lines.append(Line._make((*first, "per_category", category, kind, _number(value))))
+    return lines
+
+
+def read_lines(results: Path) -> list[Line]:
+    """The inverse of `write_frame`: runs.csv; empty if it is not there.
+
+    Raises:
+        ValueError: If the file is not such a frame; it is named.
+    """
+    path = results / "runs.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        head, *rows = csv.reader(file)
+    try:
+        if tuple(head) != Line._fields:
+            raise ValueError(f"columns {', '.join(head)}")
+        return [_line(*row) for row in rows]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: must be as vlgs.tables writes it, got: {error}") from error
+
+
+def _line(*row: str) -> Line:
+    line = Line(*row)  # pyright: ignore[reportArgumentType]
+    return line._replace(
+        seed=int(line.seed),
+        results_version=int(line.results_version),
+        value=float(line.value or "nan"),
+        **{name: getattr(line, name) or None for name in ("protocol", "commit", "cpu")},
+    )
+
+
+def by_row(lines: Iterable[Line]) -> Lines:
+    """The lines of each row of a table together."""
+    rows: dict[tuple[str, str], list[Line]] = {}
+    for line in lines:
+        rows.setdefault((line.recipe, line.data_recipe), []).append(line)
+    return rows
+
+
+def tidy(lines: Sequence[Line]) -> pd.DataFrame:
+    """The fields of `Line` as columns."""
+    return pd.DataFrame(lines, columns=pd.Index(Line._fields))
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
 
 
 def write_frame(frame: pd.DataFrame, results: Path) -> None:

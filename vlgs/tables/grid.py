@@ -2,11 +2,9 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import pandas as pd
-
-from vlgs.tables.fill import Filled
+from vlgs.tables.fill import Filled, Place
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE
 
@@ -64,14 +62,16 @@ def number(value: float, digits: int, signed: bool = False) -> str:
 
 def arrange(filled: Filled) -> Grid:
     """Rows as lines and columns as entries; a table by category is turned round."""
-    cells = _entries(filled.cells)
+    cells = {
+        place: Entry(*cell, QUANTITIES[place.metric].digits) for place, cell in filled.cells.items()
+    }
     if filled.table.by_category:
         return _by_category(filled, cells)
     table = filled.table
     columns = tuple((c, m) for c in filled.columns for m in table.metrics)
     lines = []
     for index, row in enumerate(table.rows):
-        entries = tuple(cells[index, c, m] for c, m in columns)
+        entries = tuple(cells[Place(index, c, m)] for c, m in columns)
         lines.append(Line(row.group, row.label, tuple(row.marks.values()), entries))
     several = len(table.metrics) > 1
     headers = tuple(
@@ -84,11 +84,11 @@ def arrange(filled: Filled) -> Grid:
     return Grid(mark_names, columns, headers, tuple(_ranked(lines, columns)), ())
 
 
-def _by_category(filled: Filled, cells: Mapping[tuple[int, str, str], Entry]) -> Grid:
+def _by_category(filled: Filled, cells: Mapping[Place, Entry]) -> Grid:
     table, metric = filled.table, filled.table.metrics[0]
     lines = []
     for category in filled.columns:
-        entries = tuple(cells[index, category, metric] for index in range(len(table.rows)))
+        entries = tuple(cells[Place(index, category, metric)] for index in range(len(table.rows)))
         first, last = entries[0], entries[-1]
         gain = Entry(
             last.mean - first.mean,
@@ -102,16 +102,6 @@ def _by_category(filled: Filled, cells: Mapping[tuple[int, str, str], Entry]) ->
     labels = tuple(row.label for row in table.rows)
     columns = tuple((label, metric) for label in (*labels, "Gain"))
     return Grid((), columns, (*labels, "Gain"), tuple(lines), labels)
-
-
-def _entries(cells: pd.DataFrame) -> dict[tuple[int, str, str], Entry]:
-    """Cells by row, column and metric."""
-    keys = zip(cells["row"].astype(int), cells["column"], cells["metric"], strict=True)
-    numbers = cells[["mean", "std", "seeds", "paper", "difference"]].to_numpy(float)
-    return {
-        key: Entry(mean, std, int(seeds), paper, difference, QUANTITIES[key[2]].digits)
-        for key, (mean, std, seeds, paper, difference) in zip(keys, numbers, strict=True)
-    }
 
 
 def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Line]:
@@ -138,7 +128,7 @@ def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Lin
             line.label,
             line.marks,
             tuple(
-                Entry(**(vars(entry) | {"rank": ranked.get((i, j), 0)}))
+                replace(entry, rank=ranked[i, j]) if (i, j) in ranked else entry
                 for j, entry in enumerate(line.entries)
             ),
         )
@@ -148,7 +138,7 @@ def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Lin
 
 def caption(filled: Filled) -> str:
     """The registry's caption and what the numbers are."""
-    seeds = sorted({entry for entry in filled.cells["seeds"] if entry})
+    seeds = sorted({cell.seeds for cell in filled.cells.values() if cell.seeds})
     if not seeds:
         said = "No runs yet."
     elif seeds == [1]:
@@ -167,24 +157,9 @@ def caption(filled: Filled) -> str:
     return " ".join(parts)
 
 
-def provenance(filled: Filled) -> list[str]:
-    """Machine, commit, protocol, seeds and data of the runs behind a table."""
-    runs = filled.runs
-
-    def all_of(column: str) -> str:
-        return ", ".join(sorted({str(v) for v in runs[column].dropna()})) or "--"
-
-    return [
-        f"data: {' '.join(filled.benchmark.overrides)}; scenes {', '.join(filled.benchmark.scenes)}; "
-        f"seeds {', '.join(map(str, filled.benchmark.seeds))}",
-        f"runs: {len(runs)}; protocol {all_of('protocol')}; results version {all_of('results_version')}",
-        f"commit: {all_of('commit')}; machine: {all_of('cpu')}",
-    ]
-
-
 def has_paper(filled: Filled) -> bool:
     """Whether any value of the paper is printed."""
-    return bool(filled.cells["paper"].notna().any())
+    return any(math.isfinite(cell.paper) for cell in filled.cells.values())
 
 
 def average_index(grid: Grid) -> int | None:

@@ -12,7 +12,8 @@ from jinja2 import Environment
 from vlgs.files import write_atomically
 from vlgs.tables import plots
 from vlgs.tables.fill import Filled
-from vlgs.tables.grid import arrange, caption, has_paper, number, provenance
+from vlgs.tables.frame import Line
+from vlgs.tables.grid import arrange, caption, has_paper, number
 from vlgs.tables.statistics import sentence
 
 
@@ -36,7 +37,7 @@ def write_report(
         write_atomically(pictures / f"{name}.png", png)
         return f"plots/{name}.png"
 
-    hashes = {h for table in filled for h in table.runs["config_hash"]}
+    hashes = {run.config_hash for table in filled for run in table.runs}
     mine = frame[frame["config_hash"].isin(hashes)]
     full = _full_model(filled)
     whole = [
@@ -61,7 +62,7 @@ def write_report(
             _section(table, keep(table.table.label, plots.rows_compared(table))) for table in filled
         ],
         whole=[(title, keep(name, png)) for title, name, png in whole if png is not None],
-        provenance=provenance(filled[0]) if filled else [],
+        provenance=filled[0].provenance if filled else [],
     )
     write_atomically(folder / "index.html", text.encode())
 
@@ -108,28 +109,30 @@ def _titles(filled: Sequence[Filled]) -> dict[str, str]:
     return titles
 
 
-def _full_model(filled: Sequence[Filled]) -> pd.DataFrame:
+def _full_model(filled: Sequence[Filled]) -> list[Line]:
     """Runs of the configuration without overrides."""
     for table in filled:
         for index, recipe in table.recipes.items():
             if table.table.rows[index].overrides == ():
-                return table.runs[table.runs["recipe"] == recipe].sort_values(["scene", "seed"])
-    return pd.DataFrame(columns=["config_hash", "scene"])
+                runs = [run for run in table.runs if run.recipe == recipe]
+                return sorted(runs, key=lambda run: (run.scene, run.seed))
+    return []
 
 
-def _curves(runs: pd.DataFrame, results: Path) -> dict[str, list[pd.DataFrame]]:
+def _curves(runs: Sequence[Line], results: Path) -> dict[str, list[pd.DataFrame]]:
     curves: dict[str, list[pd.DataFrame]] = {}
-    for config_hash, scene in zip(runs["config_hash"], runs["scene"], strict=True):
-        path = results / "runs" / config_hash / "log.csv"
+    for run in runs:
+        path = results / "runs" / run.config_hash / "log.csv"
         if path.is_file():
-            curves.setdefault(scene, []).append(pd.read_csv(path))
+            curves.setdefault(run.scene, []).append(pd.read_csv(path))
     return curves
 
 
-def _histograms(runs: pd.DataFrame, results: Path) -> list[dict[str, list[float]]]:
+def _histograms(runs: Sequence[Line], results: Path) -> list[dict[str, list[float]]]:
     found = []
-    for config_hash in runs["config_hash"]:
-        metrics = json.loads((results / "runs" / config_hash / "metrics.json").read_text())
+    for run in runs:
+        path = results / "runs" / run.config_hash / "metrics.json"
+        metrics = json.loads(path.read_text()) if path.is_file() else {}
         if metrics.get("indicator"):
             found.append(metrics["indicator"])
     return found

@@ -13,7 +13,6 @@ from vlgs.tables.grid import (
     caption,
     has_paper,
     number,
-    provenance,
 )
 
 _SPECIAL = {
@@ -58,7 +57,7 @@ def to_latex(filled: Filled) -> str:
     rows = _with_groups(grid, body, grouped)
     return "\n".join(
         [
-            *(f"% {line}" for line in provenance(filled)),
+            *(f"% {line}" for line in filled.provenance),
             r"\begin{table}[htbp]",
             r"\centering",
             rf"\caption{{{escape(caption(filled))}}}",

@@ -1,10 +1,11 @@
 """A table in Markdown, and the head that every committed file of results carries."""
 
 import math
-from collections.abc import Sequence
 
-from vlgs.tables.fill import Filled
-from vlgs.tables.grid import Entry, arrange, caption, has_paper, number, provenance
+import pandas as pd
+
+from vlgs.tables.fill import Cell, Filled, Place
+from vlgs.tables.grid import Entry, arrange, caption, has_paper, number
 from vlgs.tables.statistics import sentence
 
 
@@ -30,7 +31,7 @@ def to_markdown(filled: Filled) -> str:
                 table,
                 *said,
                 *notes,
-                "\n".join(provenance(filled)),
+                "\n".join(filled.provenance),
             ]
         )
         + "\n"
@@ -39,12 +40,14 @@ def to_markdown(filled: Filled) -> str:
 
 def to_csv(filled: Filled) -> str:
     """The cells with their provenance as comment lines (`pandas.read_csv(..., comment="#")`)."""
-    head: Sequence[str] = [f"# {line}" for line in provenance(filled)]
-    return (
-        "\n".join(head)
-        + "\n"
-        + filled.cells.drop(columns="row").to_csv(index=False, float_format="%.4f")
-    )
+    rows = filled.table.rows
+    cells = [
+        (rows[place.row].group, rows[place.row].label, place.column, place.metric, *cell)
+        for place, cell in filled.cells.items()
+    ]
+    columns = pd.Index(("group", "label", *Place._fields[1:], *Cell._fields))
+    body = pd.DataFrame(cells, columns=columns).to_csv(index=False, float_format="%.4f")
+    return "".join(f"# {line}\n" for line in filled.provenance) + body
 
 
 def _cell(entry: Entry, paper: bool) -> str:

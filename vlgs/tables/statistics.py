@@ -2,14 +2,15 @@
 
 import itertools
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-import pandas as pd
 
-from vlgs.tables.fill import Filled
+from vlgs.tables.fill import Filled, Place
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE
 
@@ -41,14 +42,11 @@ class Difference:
 
 def paired_differences(filled: Filled, metric: str) -> list[Difference]:
     """Every row against the full model of its group, or of the table where the group has none."""
-    table, values = filled.table, filled.values
-    values = values[(values["metric"] == metric) & (values["column"] != AVERAGE)]
+    table, out = filled.table, []
     numbers: dict[int, dict[tuple[str, int], float]] = {}
-    for row, column, seed, value in zip(
-        values["row"], values["column"], values["seed"], values["value"], strict=True
-    ):
-        numbers.setdefault(row, {})[column, seed] = value
-    out = []
+    for number in filled.numbers:
+        if number.metric == metric and number.column != AVERAGE:
+            numbers.setdefault(number.row, {})[number.column, number.seed] = number.value
     for index, row in enumerate(table.rows):
         reference = _full_model(filled, row.group)
         if reference is None or index == reference or not row.overrides:
@@ -93,20 +91,27 @@ def bootstrap_interval(by_scene: Sequence[np.ndarray], seed: int) -> tuple[float
     """
     if sum(len(part) for part in by_scene) < 2:
         return -math.inf, math.inf
-    rng = np.random.default_rng(seed)
-    sizes = np.array([len(part) for part in by_scene])
-    padded = np.zeros((len(by_scene), sizes.max()))
-    for row, part in zip(padded, by_scene, strict=True):
-        row[: len(part)] = part
-    scenes = rng.integers(len(by_scene), size=(RESAMPLES, len(by_scene)))  # [b, k]
-    drawn = sizes[scenes][..., None]  # seeds of the scene that was drawn, [b, k, 1]
-    seeds = (rng.random((*scenes.shape, sizes.max())) * drawn).astype(int)
-    values = padded[scenes[..., None], seeds]
-    values[np.broadcast_to(np.arange(sizes.max()) >= drawn, values.shape)] = 0.0
-    means = (values.sum(axis=2) / drawn[..., 0]).mean(axis=1)
+    means = _resampled(tuple(map(len, by_scene)), seed) @ np.concatenate(by_scene)
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
     return float(low), float(high)
+
+
+@lru_cache(maxsize=64)
+def _resampled(sizes: tuple[int, ...], seed: int) -> np.ndarray:
+    """Weights of all numbers, scene after scene, in each of `RESAMPLES` means; the rows of many tables share them."""
+    rng = np.random.default_rng(seed)
+    draws, most = np.arange(RESAMPLES)[:, None, None], max(sizes)
+    scenes = rng.integers(len(sizes), size=(RESAMPLES, len(sizes)))  # [b, k]
+    drawn = np.array(sizes)[scenes][..., None]  # seeds of the scene that was drawn, [b, k, 1]
+    seeds = (rng.random((*scenes.shape, most)) * drawn).astype(int)
+    counts = np.arange(most) < drawn
+    weights = np.zeros((RESAMPLES, sum(sizes)))
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    np.add.at(
+        weights, (draws, starts[scenes][..., None] + seeds * counts), counts / drawn / len(sizes)
+    )
+    return weights
 
 
 def judge(low: float, high: float, paper: float) -> Verdict:
@@ -199,16 +204,14 @@ def _full_model(filled: Filled, group: str) -> int | None:
 
 
 def _ours(filled: Filled, row: int, metric: str) -> float:
-    cells = filled.cells
-    chosen = cells["mean"][(cells["row"] == row) & (cells["metric"] == metric)]
-    if AVERAGE in filled.columns:
-        chosen = chosen[cells["column"] == AVERAGE]
-    return float(chosen.mean(skipna=False)) if len(chosen) else math.nan
+    columns = (AVERAGE,) if AVERAGE in filled.columns else filled.columns
+    means = [filled.cells[Place(row, column, metric)].mean for column in columns]
+    return statistics.fmean(means) if means else math.nan
 
 
 def _paper(filled: Filled, row: int, metric: str) -> float:
     printed = filled.table.rows[row].paper
     if filled.table.by_category or AVERAGE not in printed:
         numbers = [values[metric] for values in printed.values() if metric in values]
-        return float(pd.Series(numbers).mean()) if numbers else math.nan
+        return statistics.fmean(numbers) if numbers else math.nan
     return printed[AVERAGE].get(metric, math.nan)

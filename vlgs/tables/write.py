@@ -6,7 +6,15 @@ from pathlib import Path
 from vlgs.files import write_atomically
 from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.fill import Filled, fill
-from vlgs.tables.frame import read_metrics, require_one_meaning, tidy, write_frame
+from vlgs.tables.frame import (
+    by_row,
+    read_lines,
+    read_metrics,
+    require_one_meaning,
+    tidy,
+    to_lines,
+    write_frame,
+)
 from vlgs.tables.latex import document, to_latex
 from vlgs.tables.markdown import to_csv, to_markdown
 from vlgs.tables.registry import Table
@@ -16,6 +24,8 @@ def write_all(
     results: Path, tables: Sequence[Table], name: str | None = None, html: bool = False
 ) -> list[Path]:
     """Write the frame of all runs and the tables of every benchmark.
+
+    Where there is no folder of a run, as in a fresh clone, the tables are written from the frame.
 
     Args:
         results: Folder of the runs and of the benchmarks.
@@ -28,7 +38,7 @@ def write_all(
         The folders that were written.
 
     Raises:
-        ValueError: If there is no benchmark, or runs that must not stand in one table, or a table has an option that no benchmark
+        ValueError: If there is no benchmark or no run, or runs that must not stand in one table, or a table has an option that no benchmark
             has.
     """
     files = sorted(results.glob(f"{name or '*'}/benchmark.yaml"))
@@ -37,9 +47,16 @@ def write_all(
             f"tables: {results} must hold a benchmark ({name or '<name>'}/benchmark.yaml, written by python -m vlgs.ablate), "
             "got none"
         )
-    frame = tidy(read_metrics(results))
+    found = to_lines(read_metrics(results))
+    lines = found or read_lines(results)
+    if not lines:
+        raise ValueError(
+            f"tables: {results} must hold finished runs (runs/*/metrics.json) or runs.csv, got neither"
+        )
+    frame, rows = tidy(lines), by_row(lines)
     require_one_meaning(frame)
-    write_frame(frame, results)
+    if found:
+        write_frame(frame, results)
     refused: dict[str, UnknownOptionError] = {}
     fitting: set[str] = set()
     for file in files:
@@ -48,7 +65,7 @@ def write_all(
         filled: list[Filled] = []
         for table in tables:
             try:
-                filled.append(fill(table, benchmark, composer, frame))
+                filled.append(fill(table, benchmark, composer, rows))
                 fitting.add(table.label)
             except UnknownOptionError as error:
                 refused[table.label] = error
