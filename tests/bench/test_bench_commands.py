@@ -86,7 +86,7 @@ def test_reading_and_protocols_leave_their_stages_and_costs(tmp_path: Path):
         ]
         for growing in ("wall_seconds", "cpu_seconds", "peak_mib"):
             assert stages[growing].is_monotonic_increasing
-    assert list(reading.language.unique()) == [False, True]
+    assert list(reading.language.unique()) == ["none", "codec fitted", "codec cached"]
     assert set(protocols.protocol) >= {"dense", "lerf_ovs", "lerf_ovs (v2)", "select3d"}
 
 

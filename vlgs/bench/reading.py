@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -24,11 +24,15 @@ POINTS = 50_000
 STEPS = 3
 
 
+Language = Literal["none", "codec fitted", "codec cached"]
+"""Whether there is language, and whether its codec, the first stage of training, is there from a run before."""
+
+
 @dataclass(frozen=True)
 class Reached:
     """Where a process has come to, since it was started."""
 
-    language: bool
+    language: Language
     images: int
     width: int
     height: int
@@ -47,12 +51,13 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
     header = provenance(seed, note=notes)
     rows: list[Reached] = []
     with tempfile.TemporaryDirectory(prefix="vlgs-reading-") as scratch:
-        for language in (False, True):
-            root = Path(scratch) / f"language_{language}"
-            write_photographs(root, images, size, language, seed)
+        for language in get_args(Language):
+            root = Path(scratch) / ("photographs" if language == "none" else "with_language")
+            if not root.is_dir():
+                write_photographs(root, images, size, language != "none", seed)
             started = time.time()
             with Child() as child:
-                for stage, *reached in child.call(stages, root, started):
+                for stage, *reached in child.call(stages, root, started, Path(scratch) / "codecs"):
                     rows.append(Reached(language, images, *size, stage, *reached))
     write_sheet(out / "reading.csv", rows, header)
     show(
@@ -60,7 +65,7 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
         ("language, stage", "wall s", "CPU s", "peak MiB"),
         [
             (
-                f"{'with' if row.language else 'without'}, {row.stage}",
+                f"{row.language}, {row.stage}",
                 f"{row.wall_seconds:.1f}",
                 f"{row.cpu_seconds:.1f}",
                 f"{row.peak_mib:.0f}",
@@ -71,12 +76,13 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
     return rows
 
 
-def stages(root: Path, started: float) -> list[tuple[str, float, float, float]]:
+def stages(root: Path, started: float, codecs: Path) -> list[tuple[str, float, float, float]]:
     """What `python -m vlgs.run data=colmap data.root=ROOT trainer=photos` does up to its first steps.
 
     Args:
         root: Scene.
         started: `time.time()` at the start of this process.
+        codecs: Folder that fitted codecs are kept in.
 
     Returns:
         Stage, and from its wall seconds on the columns of `Reached`.
@@ -89,7 +95,7 @@ def stages(root: Path, started: float) -> list[tuple[str, float, float, float]]:
     def reach(stage: str) -> None:
         rows.append((stage, time.time() - started, time.process_time(), peak_mib()))
 
-    options = ["data=colmap", f"data.root={root}", "trainer=photos", "codec.cache_dir=null"]
+    options = ["data=colmap", f"data.root={root}", "trainer=photos", f"codec.cache_dir={codecs}"]
     config = composed(options)
     reach("imports")
     scene = instantiate(config.data)

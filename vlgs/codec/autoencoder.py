@@ -209,6 +209,7 @@ class Autoencoder(nn.Module):
                 score = self._measure(vectors, areas)
                 if score > best[0]:
                     best = score, {k: v.clone() for k, v in self.state_dict().items()}
+        optimizer.zero_grad()  # weights that stay as they are need no room for gradients
         self.load_state_dict(best[1])
 
     def _loss(

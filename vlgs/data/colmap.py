@@ -11,7 +11,7 @@ to a photograph (undistort, resize) it does to them.
 
 import hashlib
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ class ColmapSource:
     allow_missing_masks: bool = False
     """Whether a training view may lack language maps where others have them."""
     cache_bytes: int = 1 << 26
-    """Decoded pixels that are kept in memory."""
+    """Memory for decoded pixels: those of all views are kept, or none, and always the tables of undistortion."""
     release: Mapping[str, Any] = field(default_factory=dict)
     """What the paths of a data set's configuration are put together from; `name` says what is looked for."""
 
@@ -308,7 +308,10 @@ def _assemble(source: ColmapSource, parts: _Parts) -> Scene:
     """The scene of files that are sound."""
     train, test = source.rule.divide(*_names(parts.views))
     bound = parts.masks.sources if parts.masks is not None else {}
-    readable = {v.name: bound.get(v.name, v).view() for v in parts.views}
+    sources = [bound.get(view.name, view) for view in parts.views]
+    # A part of them would be found again too seldom to be worth its memory, which it would leave in pieces.
+    keep = sum(view.decoded_bytes for view in sources) <= source.cache_bytes
+    readable = {view.name: replace(view, keep=keep).view() for view in sources}
     empty = torch.zeros(0, 512 if parts.vocabulary is None else parts.vocabulary.vectors.shape[1])
     classes, kinds = _classes(parts.labels, {v.name for v in parts.views})
     return Scene(

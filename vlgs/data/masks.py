@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -61,20 +62,22 @@ def gather_masks(
     Returns:
         The table and what is wrong with the files that there are. Views without files, or with faulty ones, are not in it.
     """
+    found = [(view, find_mask_files(folder, view.name)) for view in views]
+    sources = [replace(view, masks=files, level=level) for view, files in found if files]
     faults: list[Fault] = []
     read: list[ViewMasks] = []
-    for view in views:
-        files = find_mask_files(folder, view.name)
-        if files is None:
-            continue
-        try:
-            masks = _read_view(replace(view, masks=files, level=level))
-            if read and masks.vectors.shape[1] != read[0].vectors.shape[1]:
+    # NumPy and the hash let go of the interpreter.
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for masks in pool.map(_read_or_fault, sources):
+            if isinstance(masks, Fault):
+                faults.append(masks)
+            elif read and masks.vectors.shape[1] != read[0].vectors.shape[1]:
                 what = f"vectors must be {read[0].vectors.shape[1]} wide as those of {read[0].source.name}"
-                raise SceneError(Fault(str(files.vectors), f"{what}, got {masks.vectors.shape[1]}"))
-            read.append(masks)
-        except SceneError as error:
-            faults.append(error.fault)
+                assert masks.source.masks is not None
+                path = str(masks.source.masks.vectors)
+                faults.append(Fault(path, f"{what}, got {masks.vectors.shape[1]}"))
+            else:
+                read.append(masks)
     return _stack(read), tuple(faults)
 
 
@@ -120,6 +123,13 @@ def width_warnings(table: MaskTable, folder: Path) -> Iterator[Fault]:
             "these look like LangSplat's codes (language_features_dim3): take language_features"
         )
         yield warning(folder, what, advice)
+
+
+def _read_or_fault(source: ViewSource) -> ViewMasks | Fault:
+    try:
+        return _read_view(source)
+    except SceneError as error:
+        return error.fault
 
 
 def _read_view(source: ViewSource) -> ViewMasks:

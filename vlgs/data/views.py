@@ -1,5 +1,6 @@
 """One view's files behind the readers of `vlgs.types.View`: decoded when asked, warped by one lens, kept within a limit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,13 @@ class ViewSource:
     level: int = 0
     rows: Int32[np.ndarray, " r"] | None = None
     """Entry i + 1 is the row of `Scene.mask_vectors` that the view's mask id i has, or -1; the first one is for id -1."""
+    keep: bool = True
+    """Whether decoded pixels are kept; tables of the lens always are."""
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Of the photograph, and of the masks if there are any."""
+        return self.camera.width * self.camera.height * (3 if self.rows is None else 3 + 4)
 
     def view(self) -> View:
         """This view with a reader for everything that it has."""
@@ -59,15 +67,15 @@ class ViewSource:
 
     def read_image(self) -> UInt8[Tensor, "h w 3"]:
         """The photograph, undistorted bilinearly and then shrunk by area averages. Shared: do not write into it."""
-        return self.cache.get(("image", self.name), self._make_image)
+        return self._decoded("image", self._make_image)
 
     def read_masks(self) -> Int[Tensor, "h w"]:
         """Row of `Scene.mask_vectors` per pixel, -1 where no mask lies (int32). Shared: do not write into it."""
-        return self.cache.get(("masks", self.name), self._make_masks)
+        return self._decoded("masks", self._make_masks)
 
     def read_dense_labels(self) -> DenseLabels:
         """Class ids, `IGNORE_ID` where the photograph has no pixels."""
-        return DenseLabels(self.cache.get(("labels", self.name), self._make_ids))
+        return DenseLabels(self._decoded("labels", self._make_ids))
 
     def read_object_labels(self) -> ObjectLabels:
         """Masks and boxes of the labelled objects, moved to the output's pixels."""
@@ -108,6 +116,9 @@ class ViewSource:
         warped = values.ravel().take(index, mode="clip")
         warped[index < 0] = fill
         return warped
+
+    def _decoded(self, what: str, make: Callable[[], Tensor]) -> Tensor:
+        return self.cache.get((what, self.name), make) if self.keep else make()
 
     def _nearest(self, map_size: tuple[int, int]) -> Int64[Tensor, "h w"]:
         key = ("nearest", self.lens, map_size)
