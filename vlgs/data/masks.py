@@ -146,8 +146,10 @@ def _read_view(source: ViewSource) -> ViewMasks:
     areas = np.bincount(ids.ravel() + 1, minlength=len(vectors) + 1)[1:]
     used = np.flatnonzero(areas)
     own = vectors[used]
-    digest = hashlib.blake2b(ids.tobytes() + own.tobytes(), digest_size=16).digest()
-    return ViewMasks(source, used, len(vectors), own, areas[used].astype(np.float32), digest)
+    content = hashlib.blake2b(np.ascontiguousarray(ids), digest_size=16)
+    content.update(own)
+    covered = areas[used].astype(np.float32)
+    return ViewMasks(source, used, len(vectors), own, covered, content.digest())
 
 
 def _stack(read: Sequence[ViewMasks]) -> MaskTable:

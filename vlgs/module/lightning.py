@@ -49,7 +49,7 @@ class StepReport:
     step: int = -1
     views: tuple[str, ...] = ()
     renders: tuple[ViewRender, ...] = ()
-    """The real views only; their `mean2d.grad` feeds densification."""
+    """The real views only, without their graph, which holds the tile lists of all views: the next step makes its own."""
     loss: float = math.nan
     color_mse: float = math.nan
     blend_weight: float = 0.0
@@ -166,7 +166,8 @@ class VLGSModule(L.LightningModule):
         self.next_step = step + 1
         mse = self._color_mse(color_losses, renders, targets)
         weight = 0.0 if plan is None else plan.weight
-        self.report = StepReport(step, views, tuple(renders), float(total.detach()), mse, weight)
+        seen = tuple(render.detach() for render in renders)
+        self.report = StepReport(step, views, seen, float(total.detach()), mse, weight)
 
     def target(self, index: int) -> Target:
         """Image, code map and mask of a training view."""

@@ -1,7 +1,8 @@
 """A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -45,6 +46,11 @@ class ViewRender:
     alpha_language: Float[Tensor, "h w *levels"] | None
     visible: Bool[Tensor, " n"]
     mean2d: Float[Tensor, "n 2"]
+
+    def detach(self) -> "ViewRender":
+        """The same pixels, from which no gradient can be asked."""
+        tensors: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        return ViewRender(**{k: None if t is None else t.detach() for k, t in tensors.items()})
 
 
 class SplatModel(nn.Module):
