@@ -60,14 +60,17 @@ def read_mask_ids(files: MaskFiles, level: int, n_vectors: int) -> Int32[np.ndar
     """
     levels = _open_ids(files.ids)
     raw = np.asarray(levels[level])
-    whole = np.isfinite(raw) & (raw >= -1) & (raw < n_vectors) & (raw == np.trunc(raw))
-    if not whole.all():
+    with np.errstate(invalid="ignore"):  # what is no number becomes one that it is not equal to
+        ids = raw.astype(np.int32)
+    # One look at most maps; only of a faulty one it is asked where.
+    if ids.size and not (np.array_equal(ids, raw) and -1 <= ids.min() and ids.max() < n_vectors):
+        whole = np.isfinite(raw) & (raw >= -1) & (raw < n_vectors) & (raw == np.trunc(raw))
         at = np.argwhere(~whole)[0].tolist()
         expected = f"whole numbers from -1 to {n_vectors - 1}, the rows of {files.vectors.name}"
         what = f"ids of level {level} must be {expected}, got {raw[tuple(at)]} at row {at[0]}, column {at[1]}"
         raise SceneError(Fault(str(files.ids), what))
-    ids = raw.astype(np.int32)
-    first = ids[ids >= 0].min(initial=n_vectors)
+    # Unsigned, -1 is the largest.
+    first = int(ids.view(np.uint32).min(initial=n_vectors))
     before = max((levels[lower].max() for lower in range(level)), default=-1)
     if first < n_vectors and not before < first:
         expected = f"above {before:.0f}, the last one of the levels before"

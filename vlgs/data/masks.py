@@ -146,8 +146,8 @@ def _read_view(source: ViewSource) -> ViewMasks:
     areas = np.bincount(ids.ravel() + 1, minlength=len(vectors) + 1)[1:]
     used = np.flatnonzero(areas)
     own = vectors[used]
-    content = hashlib.blake2b(np.ascontiguousarray(ids), digest_size=16)
-    content.update(own)
+    content = hashlib.blake2b(np.ascontiguousarray(ids).data, digest_size=16)
+    content.update(own.data)
     covered = areas[used].astype(np.float32)
     return ViewMasks(source, used, len(vectors), own, covered, content.digest())
 

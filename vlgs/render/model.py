@@ -1,8 +1,7 @@
 """A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -49,8 +48,8 @@ class ViewRender:
 
     def detach(self) -> "ViewRender":
         """The same pixels, from which no gradient can be asked."""
-        tensors: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return ViewRender(**{k: None if t is None else t.detach() for k, t in tensors.items()})
+        tensors = ((f.name, getattr(self, f.name)) for f in fields(self))
+        return replace(self, **{name: t.detach() for name, t in tensors if t is not None})
 
 
 class SplatModel(nn.Module):
