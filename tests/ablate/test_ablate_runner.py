@@ -94,6 +94,17 @@ def test_a_failure_is_shown_with_its_log_and_the_others_go_on(
     assert "--" in (results / "synthetic" / "tiny.md").read_text()
 
 
+def test_where_every_run_fails_no_table_is_written(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    results = tmp_path / "r"
+    behave(results, none0=["error"], self0=["error"])
+    assert ablate(request_of(table, results)) == 1
+    assert capsys.readouterr().out.count("error: fake: scene must be good, got bad") == 2
+    assert {path.name for path in (results / "synthetic").iterdir()} == {"benchmark.yaml"}
+    assert not (results / "runs.csv").exists()
+
+
 def test_a_killed_run_is_tried_again_but_not_for_ever(
     table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -311,9 +311,10 @@ def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Pa
     write_all(tmp_path, [table], html=True)
     assert [file.read_bytes() for file in files] == before
 
-    files[0].write_text("config_hash,value\na,1\n")
-    with pytest.raises(ValueError, match=r"runs.csv: must be as vlgs.tables writes it"):
-        write_all(tmp_path, [table])
+    for broken in ("config_hash,value\na,1\n", ""):
+        files[0].write_text(broken)
+        with pytest.raises(ValueError, match=r"runs.csv: must be as vlgs.tables writes it"):
+            write_all(tmp_path, [table])
     files[0].write_bytes(before[0].replace(b",0,dense@1", b",first,dense@1"))
     with pytest.raises(ValueError, match=r"runs.csv: must be as .*first"):
         write_all(tmp_path, [table])

@@ -170,6 +170,8 @@ def ablate(request: Request) -> int:
     if stopping.is_set():
         console.print("stopped and saved; the same command goes on from here")
         return STOPPED
+    if tally.failed and not read_metrics(results):
+        return 1  # there is nothing to write yet
     for path in write_all(results, request.tables, benchmark.name, html=True):
         console.print(f"tables: {path}")
     return 1 if tally.failed else 0

@@ -91,13 +91,14 @@ def read_lines(results: Path) -> list[Line]:
     if not path.is_file():
         return []
     with path.open(newline="") as file:
-        head, *rows = csv.reader(file)
-    try:
-        if tuple(head) != Line._fields:
-            raise ValueError(f"columns {', '.join(head)}")
-        return [_line(*row) for row in rows]
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: must be as vlgs.tables writes it, got: {error}") from error
+        rows = csv.reader(file)
+        head = next(rows, [])
+        try:
+            if tuple(head) != Line._fields:
+                raise ValueError(f"columns {', '.join(head) or 'none'}")
+            return [_line(*row) for row in rows]
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: must be as vlgs.tables writes it, got: {error}") from error
 
 
 def _line(*row: str) -> Line:
