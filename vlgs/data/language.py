@@ -63,7 +63,7 @@ def read_mask_ids(files: MaskFiles, level: int, n_vectors: int) -> Int32[np.ndar
     with np.errstate(invalid="ignore"):  # what is no number becomes one that it is not equal to
         ids = raw.astype(np.int32)
     # One look at most maps; only of a faulty one it is asked where.
-    if ids.size and not (np.array_equal(ids, raw) and -1 <= ids.min() and ids.max() < n_vectors):
+    if ids.size and not (np.array_equal(ids, raw) and ids.min() >= -1 and ids.max() < n_vectors):
         whole = np.isfinite(raw) & (raw >= -1) & (raw < n_vectors) & (raw == np.trunc(raw))
         at = np.argwhere(~whole)[0].tolist()
         expected = f"whole numbers from -1 to {n_vectors - 1}, the rows of {files.vectors.name}"
