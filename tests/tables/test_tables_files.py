@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -322,6 +323,23 @@ def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Pa
     with pytest.raises(ValueError, match="must hold finished runs"):
         write_all(tmp_path, [table])
     assert [file.read_bytes() for file in files[1:]] == before[1:]
+
+
+def test_runs_without_a_folder_stay_beside_new_ones(
+    table: Table, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    fake_runs(tmp_path, [table], BENCHMARK, value)  # seeds 0 and 1
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    write_all(tmp_path, [table])
+    shutil.rmtree(tmp_path / "runs")
+    again = replace(BENCHMARK, seeds=(1, 2))
+    fake_runs(tmp_path, [table], again, lambda row, scene, seed: 0.9)
+    write_all(tmp_path, [table])
+    assert "6 runs that have no folder here are kept" in caplog.text
+    frame = pd.read_csv(tmp_path / "runs.csv")
+    assert set(frame["seed"]) == {0, 1, 2}
+    assert len(frame["config_hash"].unique()) == 18
+    assert set(frame["value"][(frame["metric"] == "miou") & (frame["seed"] > 0)]) == {0.9}
 
 
 def test_tables_without_torch_on_400_runs(tmp_path: Path):

@@ -6,8 +6,8 @@
     python -m vlgs.tables html=true        index.html with plots too
 
 Writes results/runs.csv (one row per run, metric and category; runs.parquet with pyarrow), and per benchmark <label>.csv, .md and
-.tex, and tables.tex over all of them. Nothing is trained, and nothing that has no run is filled in. Where results/runs is empty, as in
-a fresh clone, the tables are written from runs.csv.
+.tex, and tables.tex over all of them. Nothing is trained, and nothing that has no run is filled in. Runs that stand in runs.csv and have
+no folder here, as in a fresh clone, stay; delete the file to leave them out.
 """
 
 import gc

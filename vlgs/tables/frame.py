@@ -2,14 +2,17 @@
 
 import csv
 import json
+import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
 from vlgs.files import write_atomically
+
+log = logging.getLogger(__name__)
 
 
 class Line(NamedTuple):
@@ -81,8 +84,12 @@ def to_lines(runs: Iterable[Mapping[str, Any]]) -> list[Line]:
     return lines
 
 
-def read_lines(results: Path) -> list[Line]:
+def read_lines(results: Path, without: Collection[str] = ()) -> list[Line]:
     """The inverse of `write_frame`: runs.csv; empty if it is not there.
+
+    Args:
+        results: Folder that it lies in.
+        without: Runs (`Line.config_hash`) that are not wanted.
 
     Raises:
         ValueError: If the file is not such a frame; it is named.
@@ -96,9 +103,34 @@ def read_lines(results: Path) -> list[Line]:
         try:
             if tuple(head) != Line._fields:
                 raise ValueError(f"columns {', '.join(head) or 'none'}")
-            return [_line(*row) for row in rows]
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}: must be as vlgs.tables writes it, got: {error}") from error
+            return [_line(*row) for row in rows if row[0] not in without]
+        except (IndexError, TypeError, ValueError) as error:
+            what = f"must be as vlgs.tables writes it, or not be there, got: {error}"
+            raise ValueError(f"{path}: {what}") from error
+
+
+def add_kept(found: Sequence[Line], results: Path) -> list[Line]:
+    """The lines of all runs that have a folder, and those of runs.csv of runs that have none: published results outlive their folders.
+
+    A run with a folder takes the place of one without that fills the same row, scene and seed.
+
+    Raises:
+        ValueError: As `read_lines`.
+    """
+    taken = {_place(line) for line in found}
+    others = read_lines(results, without={line.config_hash for line in found})
+    kept = [line for line in others if _place(line) not in taken]
+    if found and kept:
+        log.warning(
+            "%s: %d runs that have no folder here are kept; delete the file to leave them out",
+            results / "runs.csv",
+            len({line.config_hash for line in kept}),
+        )
+    return sorted([*found, *kept], key=lambda line: line.config_hash)
+
+
+def _place(line: Line) -> tuple[str, str, str, int]:
+    return line.recipe, line.data_recipe, line.scene, line.seed
 
 
 def _line(*row: str) -> Line:

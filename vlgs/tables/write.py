@@ -7,8 +7,8 @@ from vlgs.files import write_atomically
 from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import (
+    add_kept,
     by_row,
-    read_lines,
     read_metrics,
     require_one_meaning,
     tidy,
@@ -25,7 +25,7 @@ def write_all(
 ) -> list[Path]:
     """Write the frame of all runs and the tables of every benchmark.
 
-    Where there is no folder of a run, as in a fresh clone, the tables are written from the frame.
+    Runs that have no folder here, as in a fresh clone, are taken from the frame that was written before.
 
     Args:
         results: Folder of the runs and of the benchmarks.
@@ -47,16 +47,14 @@ def write_all(
             f"tables: {results} must hold a benchmark ({name or '<name>'}/benchmark.yaml, written by python -m vlgs.ablate), "
             "got none"
         )
-    found = to_lines(read_metrics(results))
-    lines = found or read_lines(results)
+    lines = add_kept(to_lines(read_metrics(results)), results)
     if not lines:
         raise ValueError(
             f"tables: {results} must hold finished runs (runs/*/metrics.json) or runs.csv, got neither"
         )
     frame, rows = tidy(lines), by_row(lines)
     require_one_meaning(frame)
-    if found:
-        write_frame(frame, results)
+    write_frame(frame, results)
     refused: dict[str, UnknownOptionError] = {}
     fitting: set[str] = set()
     for file in files:
