@@ -27,3 +27,9 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_changed(path: Path, data: bytes) -> None:
+    """`write_atomically`, unless the file holds just that: a file that stays need not wait for the disk."""
+    if not path.is_file() or path.read_bytes() != data:
+        write_atomically(path, data)

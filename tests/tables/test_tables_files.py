@@ -342,6 +342,18 @@ def test_runs_without_a_folder_stay_beside_new_ones(
     assert set(frame["value"][(frame["metric"] == "miou") & (frame["seed"] > 0)]) == {0.9}
 
 
+def test_a_table_with_nothing_but_the_full_model_is_left_out(table: Table, tmp_path: Path):
+    others = {row.label for row in table.rows if row.overrides}
+    skip = [(name, scene, seed) for name in others for scene in BENCHMARK.scenes for seed in (0, 1)]
+    fake_runs(tmp_path, [table], BENCHMARK, value, skip=skip)
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    alone = replace(
+        table, label="alone", rows=tuple(row for row in table.rows if not row.overrides)
+    )
+    write_all(tmp_path, [table, alone])
+    assert {path.stem for path in (tmp_path / "synthetic").glob("*.csv")} == {"alone"}
+
+
 def test_tables_without_torch_on_400_runs(tmp_path: Path):
     tables = [t for t in load_tables().values() if t.label in ("ab-multi", "ab-cam", "value")]
     many = Benchmark(

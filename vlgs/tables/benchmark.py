@@ -20,7 +20,7 @@ from vlgs.config import (
     check_targets,
     identity,
 )
-from vlgs.files import write_atomically
+from vlgs.files import write_atomically, write_changed
 
 
 class UnknownOptionError(ValueError):
@@ -153,7 +153,7 @@ class Composer:
         """Keep what was composed for the next time."""
         if self._cache is not None:
             self._cache.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(self._cache, json.dumps(self._known).encode())
+            write_changed(self._cache, json.dumps(self._known).encode())
 
 
 def _read_cache(path: Path | None) -> dict[str, dict[str, str]]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from vlgs.files import write_atomically
+from vlgs.files import write_atomically, write_changed
 
 log = logging.getLogger(__name__)
 
@@ -162,7 +162,7 @@ def _number(value: Any) -> float:
 
 def write_frame(frame: pd.DataFrame, results: Path) -> None:
     """Write runs.csv, and runs.parquet where pyarrow is installed."""
-    write_atomically(results / "runs.csv", frame.to_csv(index=False).encode())
+    write_changed(results / "runs.csv", frame.to_csv(index=False).encode())
     try:
         parquet = frame.to_parquet(index=False)
     except ImportError:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from vlgs.files import write_atomically
+from vlgs.files import write_changed
 from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import (
@@ -29,8 +29,8 @@ def write_all(
 
     Args:
         results: Folder of the runs and of the benchmarks.
-        tables: Which to write. One without a single run is left out, and so is one with options that the data of a benchmark do not
-            have (faults of the supervision, on photographs).
+        tables: Which to write. One without runs of two rows is left out, unless it has one row, and so is one with options that the
+            data of a benchmark do not have (faults of the supervision, on photographs).
         name: Only the tables of this benchmark.
         html: Write index.html with its plots too, of these tables.
 
@@ -68,7 +68,7 @@ def write_all(
             except UnknownOptionError as error:
                 refused[table.label] = error
         composer.save()
-        filled = [table for table in filled if len(table.runs)]
+        filled = [table for table in filled if _says_something(table)]
         write_tables(file.parent, filled)
         if html:
             from vlgs.tables.html import (
@@ -85,9 +85,14 @@ def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
     """Each table as csv, Markdown and LaTeX, and one document over all tables of the folder."""
     for table in filled:
         stem = folder / table.table.label
-        write_atomically(stem.with_suffix(".csv"), to_csv(table).encode())
-        write_atomically(stem.with_suffix(".md"), to_markdown(table).encode())
-        write_atomically(stem.with_suffix(".tex"), to_latex(table).encode())
+        write_changed(stem.with_suffix(".csv"), to_csv(table).encode())
+        write_changed(stem.with_suffix(".md"), to_markdown(table).encode())
+        write_changed(stem.with_suffix(".tex"), to_latex(table).encode())
     labels = sorted(path.stem for path in folder.glob("*.tex") if path.stem != "tables")
     text = document(f"Ablations on {folder.name}", labels)
-    write_atomically(folder / "tables.tex", text.encode())
+    write_changed(folder / "tables.tex", text.encode())
+
+
+def _says_something(table: Filled) -> bool:
+    """Whether there are runs to compare, and not those alone of a row that many tables share, the full model."""
+    return len({run.recipe for run in table.runs}) >= min(2, len(set(table.recipes.values())))
