@@ -101,7 +101,8 @@ def test_where_every_run_fails_no_table_is_written(
     behave(results, none0=["error"], self0=["error"])
     assert ablate(request_of(table, results)) == 1
     assert capsys.readouterr().out.count("error: fake: scene must be good, got bad") == 2
-    assert {path.name for path in (results / "synthetic").iterdir()} == {"benchmark.yaml"}
+    names = {path.name for path in (results / "synthetic").iterdir()}
+    assert names == {"benchmark.yaml", "recipes.json"}
     assert not (results / "runs.csv").exists()
 
 

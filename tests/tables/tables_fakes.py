@@ -25,7 +25,7 @@ def fake_runs(
     Returns:
         How many runs there are.
     """
-    composer = Composer(benchmark, results / "cache" / "recipes.json")
+    composer = Composer(benchmark, results / benchmark.name / "recipes.json")
     names = set[str]()
     for table in tables:
         for row in table.runnable:

@@ -268,7 +268,6 @@ def test_the_report_has_its_pictures(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     filled = filled_of(table, tmp_path)
     folder = tmp_path / "synthetic"
-    folder.mkdir()
     write_tables(folder, [filled])
     write_report(folder, [filled], tidy(to_lines(read_metrics(tmp_path))), tmp_path)
     text = (folder / "index.html").read_text()
@@ -340,18 +339,6 @@ def test_runs_without_a_folder_stay_beside_new_ones(
     assert set(frame["seed"]) == {0, 1, 2}
     assert len(frame["config_hash"].unique()) == 18
     assert set(frame["value"][(frame["metric"] == "miou") & (frame["seed"] > 0)]) == {0.9}
-
-
-def test_a_table_with_nothing_but_the_full_model_is_left_out(table: Table, tmp_path: Path):
-    others = {row.label for row in table.rows if row.overrides}
-    skip = [(name, scene, seed) for name in others for scene in BENCHMARK.scenes for seed in (0, 1)]
-    fake_runs(tmp_path, [table], BENCHMARK, value, skip=skip)
-    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
-    alone = replace(
-        table, label="alone", rows=tuple(row for row in table.rows if not row.overrides)
-    )
-    write_all(tmp_path, [table, alone])
-    assert {path.stem for path in (tmp_path / "synthetic").glob("*.csv")} == {"alone"}
 
 
 def test_tables_without_torch_on_400_runs(tmp_path: Path):

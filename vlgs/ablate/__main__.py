@@ -149,7 +149,7 @@ def ablate(request: Request) -> int:
     """
     console = Console(soft_wrap=True, highlight=False)
     results, benchmark = request.results, request.benchmark
-    composer = Composer(benchmark, results / "cache" / "recipes.json")
+    composer = Composer(benchmark, results / benchmark.name / "recipes.json")
     planned = plan(request.tables, benchmark, composer)
     if request.dry:
         missing, _ = _missing(planned, results, {})

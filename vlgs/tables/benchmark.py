@@ -3,9 +3,10 @@
 import hashlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -105,15 +106,16 @@ class Composer:
 
     Args:
         benchmark: Data, scenes and seeds.
-        cache: File of recipes that were composed before, by content of `conf` and overrides; it may be deleted at any time.
+        file: What each row is, for the content of `conf` that it names; committed with the tables, since composing all rows takes
+            twenty seconds. It may be deleted at any time.
     """
 
-    def __init__(self, benchmark: Benchmark, cache: Path | None = None) -> None:
+    def __init__(self, benchmark: Benchmark, file: Path | None = None) -> None:
         self.benchmark = benchmark
-        self._cache = cache
-        self._known = _read_cache(cache)
+        self._file = file
+        self._head = {"conf": _tree_digest(), "overrides": list(benchmark.recorded)}
+        self._rows = _read_rows(file, self._head)
         self._composed = False
-        self._tree = _tree_digest()
 
     def identity(self, overrides: Sequence[str], seed: int) -> Identity:
         """Recipe of a row on this benchmark.
@@ -121,21 +123,18 @@ class Composer:
         Raises:
             UnknownOptionError: If an override is not one of the configuration's.
         """
-        words = [*self.benchmark.overrides, *overrides]
-        key = hashlib.sha256("\0".join([self._tree, *words]).encode()).hexdigest()
-        if key not in self._known:
-            if self._cache is not None and not self._composed:
-                print(
-                    f"composing the rows of {self.benchmark.name}, once per change of conf",
-                    file=sys.stderr,
-                )
+        key = " ".join(overrides)
+        if key not in self._rows:
+            if self._file is not None and not self._composed:
+                what = f"composing the rows of {self.benchmark.name}, once per change of conf"
+                print(what, file=sys.stderr)
             self._composed = True
             try:
-                found = identity(_compose(words))
-                self._known[key] = {"recipe": found.recipe, "data": found.data}
+                found = identity(_compose([*self.benchmark.overrides, *overrides]))
+                self._rows[key] = {"recipe": found.recipe, "data": found.data}
             except UnknownOptionError as error:
-                self._known[key] = {"refused": str(error)}
-        known = self._known[key]
+                self._rows[key] = {"refused": str(error)}
+        known = self._rows[key]
         if "refused" in known:
             raise UnknownOptionError(known["refused"])
         return Identity(**known, seed=seed)
@@ -151,18 +150,23 @@ class Composer:
 
     def save(self) -> None:
         """Keep what was composed for the next time."""
-        if self._cache is not None:
-            self._cache.parent.mkdir(parents=True, exist_ok=True)
-            write_changed(self._cache, json.dumps(self._known).encode())
+        if self._file is not None:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            content = self._head | {"rows": self._rows}
+            text = json.dumps(content, indent=1, sort_keys=True) + "\n"
+            write_changed(self._file, text.encode())
 
 
-def _read_cache(path: Path | None) -> dict[str, dict[str, str]]:
+def _read_rows(path: Path | None, head: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """What a file remembers of the same configuration and benchmark."""
     if path is None or not path.is_file():
         return {}
     try:
-        return json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except json.JSONDecodeError:
         return {}  # only a cache
+    same = isinstance(content, dict) and {key: content.get(key) for key in head} == head
+    return content.get("rows", {}) if same else {}
 
 
 def _tree_digest() -> str:

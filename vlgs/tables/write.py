@@ -29,8 +29,8 @@ def write_all(
 
     Args:
         results: Folder of the runs and of the benchmarks.
-        tables: Which to write. One without runs of two rows is left out, unless it has one row, and so is one with options that the
-            data of a benchmark do not have (faults of the supervision, on photographs).
+        tables: Which to write. One without a single run is left out, and so is one with options that the data of a benchmark do not
+            have (faults of the supervision, on photographs).
         name: Only the tables of this benchmark.
         html: Write index.html with its plots too, of these tables.
 
@@ -59,7 +59,7 @@ def write_all(
     fitting: set[str] = set()
     for file in files:
         benchmark = Benchmark.read(file)
-        composer = Composer(benchmark, results / "cache" / "recipes.json")
+        composer = Composer(benchmark, file.parent / "recipes.json")
         filled: list[Filled] = []
         for table in tables:
             try:
@@ -68,7 +68,7 @@ def write_all(
             except UnknownOptionError as error:
                 refused[table.label] = error
         composer.save()
-        filled = [table for table in filled if _says_something(table)]
+        filled = [table for table in filled if table.runs]
         write_tables(file.parent, filled)
         if html:
             from vlgs.tables.html import (
@@ -91,8 +91,3 @@ def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
     labels = sorted(path.stem for path in folder.glob("*.tex") if path.stem != "tables")
     text = document(f"Ablations on {folder.name}", labels)
     write_changed(folder / "tables.tex", text.encode())
-
-
-def _says_something(table: Filled) -> bool:
-    """Whether there are runs to compare, and not those alone of a row that many tables share, the full model."""
-    return len({run.recipe for run in table.runs}) >= min(2, len(set(table.recipes.values())))
