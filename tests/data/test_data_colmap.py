@@ -427,6 +427,15 @@ def test_readers_return_the_same_whatever_is_kept(tmp_path: Path, cache_bytes: i
             assert torch.equal(view.read_image(), expected)
 
 
+@pytest.mark.parametrize("missing", [0, 1])
+def test_pixels_are_kept_where_those_of_all_views_fit(tmp_path: Path, missing: int):
+    stems = write_scene(tmp_path)
+    room = 3 * WIDTH * HEIGHT * len(stems)
+    scene = load_scene(str(tmp_path), cache_bytes=room - missing)
+    for view in (*scene.train, *scene.test):
+        assert (view.read_image() is view.read_image()) == (not missing)
+
+
 def test_a_photograph_damaged_after_loading_is_named(tmp_path: Path):
     write_scene(tmp_path)
     scene = load_scene(str(tmp_path))
