@@ -1,0 +1,83 @@
+"""`python -m tests.fuzz [FAMILY...] [--count N] [--seed S] [--only NUMBER] [--write FILE]`: the table "tried, right"."""
+
+import argparse
+import csv
+import importlib
+import pkgutil
+import shutil
+import sys
+import time
+from pathlib import Path
+
+from tests import fuzz
+from tests.fuzz.judge import Outcome, run_attack, scratch
+
+COLUMNS = ("family", "tried", "right", "slowest_cpu_s", "largest_mb", "wall_s")
+
+
+def families() -> list[str]:
+    """Names of the families, each a module of this folder."""
+    names = (module.name for module in pkgutil.iter_modules(fuzz.__path__))
+    return sorted(
+        name for name in names if name not in ("judge", "__main__") and not name.startswith("test_")
+    )
+
+
+def run_family(name: str, seed: int, count: int, only: int | None = None) -> list[Outcome]:
+    """All outcomes of one family."""
+    folder = scratch()
+    try:
+        attacks = importlib.import_module(f"tests.fuzz.{name}").attacks(folder, seed, count)
+        return [
+            run_attack(attack) for number, attack in enumerate(attacks) if only in (None, number)
+        ]
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def main() -> None:
+    """Run, print, exit with 1 where something was not right."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=fuzz.__doc__)
+    parser.add_argument("family", nargs="*", choices=[[], *families()], help="all without one")
+    parser.add_argument(
+        "--count",
+        type=int,
+        default=100,
+        help="attacks per family (a family with a fixed list has its own)",
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="number of one attack to run again")
+    parser.add_argument("--write", type=Path, help="csv to write the table to")
+    options = parser.parse_args()
+    rows, wrong = [], 0
+    for name in options.family or families():
+        started = time.perf_counter()
+        outcomes = run_family(name, options.seed, options.count, options.only)
+        bad = [(number, o) for number, o in enumerate(outcomes) if not o.right]
+        wrong += len(bad)
+        slowest = max((o.seconds for o in outcomes), default=0.0)
+        largest = max((o.megabytes for o in outcomes), default=0.0)
+        wall = time.perf_counter() - started
+        rows.append(
+            (
+                name,
+                len(outcomes),
+                len(outcomes) - len(bad),
+                f"{slowest:.1f}",
+                f"{largest:.0f}",
+                f"{wall:.0f}",
+            )
+        )
+        print(
+            f"{name:<16} tried {len(outcomes):>5}  right {len(outcomes) - len(bad):>5}  {slowest:.1f} s CPU, {largest:.0f} MB at most"
+        )
+        for number, outcome in bad:
+            print(f"  --only {number}  {outcome.name}: {outcome.said}")
+    if options.write:
+        with options.write.open("w", newline="") as file:
+            csv.writer(file).writerows([COLUMNS, *rows])
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()

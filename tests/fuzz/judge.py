@@ -1,0 +1,119 @@
+"""Runs one attack in a child process and says whether the project met it rightly.
+
+Right is: it worked, or it ended in one error that says who refuses what; within 10 s of CPU and 1 GB of memory, and never by a
+traceback of something else. Children are forked from a parent that has imported the project but computed nothing, so that
+thousands of attacks take minutes.
+"""
+
+import json
+import os
+import re
+import resource
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+SECONDS = 10.0
+MEGABYTES = 1000.0
+
+NAMED = re.compile(r"^(error: )?[\w./ -]+: .+", re.DOTALL)
+"""``<who>: <what> must be <expected>, got <actual>``, loosely: somebody says something."""
+
+
+@dataclass(frozen=True)
+class Attack:
+    """Something hostile that the project is given."""
+
+    name: str
+    """What was done, in words."""
+    call: Callable[[], object]
+    """Calls a public function or a `main`; what it returns does not matter."""
+    must_say: str = ""
+    """What an error must contain: the name of the file, the key."""
+    must_refuse: bool = False
+    """Whether taking it without an error is wrong."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an attack."""
+
+    name: str
+    right: bool
+    said: str
+    """The error, or what is wrong with it."""
+    seconds: float
+    """CPU time."""
+    megabytes: float
+    """Growth of the peak memory."""
+
+
+def run_attack(attack: Attack) -> Outcome:
+    """Fork, attack, judge."""
+    with tempfile.TemporaryFile() as pipe:
+        child = os.fork()
+        if child == 0:
+            _child(attack, pipe.fileno())
+        _, status, usage = os.wait4(child, 0)
+        pipe.seek(0)
+        try:
+            kind, said = json.load(pipe)
+        except json.JSONDecodeError:
+            kind, said = "died", f"the process ended with {status}"
+    seconds = usage.ru_utime + usage.ru_stime
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    megabytes = max(0, usage.ru_maxrss - before) / 1024
+    return Outcome(attack.name, *_judge(attack, kind, said, seconds, megabytes), seconds, megabytes)
+
+
+def _judge(
+    attack: Attack, kind: str, said: str, seconds: float, megabytes: float
+) -> tuple[bool, str]:
+    if kind == "died":
+        return False, said
+    if kind == "crashed":
+        return False, f"not an error of ours: {said}"
+    if seconds > SECONDS or megabytes > MEGABYTES:
+        return False, f"took {seconds:.1f} s and {megabytes:.0f} MB: {said}"
+    if kind == "worked":
+        return not attack.must_refuse, "worked" + (" but must not" if attack.must_refuse else "")
+    if not NAMED.match(said) or "Traceback" in said:
+        return False, f"does not say who: {said}"
+    if attack.must_say not in said:
+        return False, f"does not name {attack.must_say}: {said}"
+    return True, said
+
+
+def _child(attack: Attack, out: int) -> None:
+    """Attack and tell; never returns."""
+    resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
+    with tempfile.TemporaryFile() as noise:
+        os.dup2(noise.fileno(), sys.stdout.fileno())
+        os.dup2(noise.fileno(), sys.stderr.fileno())
+        try:
+            attack.call()
+            told = ("worked", "")
+        except (ValueError, OSError, FloatingPointError) as error:
+            told = ("refused", str(error))
+        except SystemExit as stop:
+            noise.seek(0)
+            words = noise.read().decode(errors="replace").strip()
+            code = stop.code
+            told = (
+                ("worked", "")
+                if not code
+                else ("refused", code if isinstance(code, str) else words)
+            )
+        except BaseException:
+            told = ("crashed", traceback.format_exc(limit=-3))
+    with os.fdopen(os.dup(out), "w") as file:
+        json.dump(told, file)
+    os._exit(0)
+
+
+def scratch() -> Path:
+    """A new folder for the files of a family."""
+    return Path(tempfile.mkdtemp(prefix="vlgs-fuzz-"))
