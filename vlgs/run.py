@@ -86,8 +86,7 @@ def _scenes(config: DictConfig) -> dict[int | None, Any]:
 def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> int:
     finished = folder.finished()
     if finished is not None:
-        log.info("this run exists: %s (nothing was computed)", folder.path)
-        return _say(finished, folder)
+        return _say(finished, folder, "already done, nothing computed")
     from vlgs.module.stages import StoppedError, train_all
 
     text = _text_encoder(config, next(reversed(scenes.values())))
@@ -102,11 +101,11 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
     return _say(_report(folder, config, scenes, models, stages, text), folder)
 
 
-def _say(metrics: dict[str, Any], folder: RunFolder) -> int:
+def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
     """Print a result; the exit status says whether it has the scores that were asked for."""
     from vlgs.report.summary import print_summary
 
-    print_summary(metrics, _places(folder))
+    print_summary(metrics, _places(folder), first=first)
     return UNSCORED if metrics.get("failure") else 0
 
 
@@ -177,7 +176,8 @@ def _report(
         write_ply(stage.folder.ply, stage.model.splats)
     evaluation = evaluate(models, scene, query, text, protocol)
     prompts, _ = prompts_of(scene, query, text)
-    timing = measure_fps(model, [view.camera for view in scene.test or scene.train], query, prompts)
+    cameras, language = [v.camera for v in scene.test or scene.train], len(scene.mask_vectors) > 0
+    timing = measure_fps(model, cameras, query, prompts, language)
     if config.pictures:
         write_pictures(folder.renders, model, scene, query, prompts)
     extra = {
