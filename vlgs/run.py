@@ -24,6 +24,8 @@ from vlgs.config import (
     run_id,
 )
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
+from vlgs.tables.multirun import note_run
+from vlgs.text import screen
 
 log = logging.getLogger(__name__)
 
@@ -37,14 +39,15 @@ def main(config: DictConfig) -> None:
     except (ValueError, OSError, FloatingPointError) as error:
         if not alone:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(screen(f"error: {error}"), file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
         if not alone:
             raise
         print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(STOPPED)
-    if status:
+    several = HydraConfig.get().mode == RunMode.MULTIRUN
+    if status and not (several and status == UNSCORED):  # whose other runs go on
         sys.exit(status)
 
 
@@ -68,6 +71,7 @@ def run(config: DictConfig) -> int:
     read += [file_digest(path, key) for key, path in given.items() if path]
     content = " ".join(filter(None, read))
     folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
+    note_run(folder.path)
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"

@@ -46,6 +46,9 @@ def screen(text: str) -> str:
 class ScreenFormatter(logging.Formatter):
     """Log lines for a terminal."""
 
+    def __init__(self, format: str = "%(message)s") -> None:
+        super().__init__(format)
+
     def format(self, record: logging.LogRecord) -> str:
         """The message as `screen` shows it."""
         return screen(super().format(record))

@@ -113,7 +113,7 @@ def test_views_are_spread_over_all():
 def test_hostile_names_have_pictures_of_their_own(tmp_path: Path):
     words = ("a b", "a/b", "x" * 300, "_$\\frac$", "A\n\x1b[31mB", "..")
     still_life = scene(3, width=60, height=40)
-    renamed = dict(zip(CLASSES, words, strict=True))
+    renamed: dict[str, str] = dict(zip(CLASSES, words, strict=True))
     names = ("cam0/001", "CON", "cam0\\001")
     hostile = replace(
         still_life,

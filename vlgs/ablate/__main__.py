@@ -40,6 +40,7 @@ from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.frame import read_metrics
 from vlgs.tables.registry import Table, choose, load_tables
 from vlgs.tables.write import write_all
+from vlgs.text import screen, visible
 
 OWN_KEYS = ("tab", "scenes", "seeds", "name", "results", "dry")
 SCENES = {
@@ -77,7 +78,7 @@ def main() -> None:
     try:
         sys.exit(ablate(read(sys.argv[1:])))
     except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(screen(f"error: {error}"))
     except KeyboardInterrupt:  # a second time
         sys.exit(STOPPED)
 
@@ -158,7 +159,8 @@ def ablate(request: Request) -> int:
         missing, _ = _missing(planned, results, {})
         console.print(f"{len(planned)} runs, {len(missing)} to do")
         for run in missing:
-            console.print(f"  python -m vlgs.run {shlex.join(run.overrides)}", markup=False)
+            command = shlex.join(["python", "-m", "vlgs.run", *run.overrides])
+            console.print(visible(f"  {command}"), markup=False)
         return 0
     benchmark.extend(results / benchmark.name / "benchmark.yaml")
     composer.save()
@@ -168,15 +170,15 @@ def ablate(request: Request) -> int:
     with stop_file(folder / STOP) as stopping:
         _run_missing(request, planned, folder, tally, stopping, console)
     for name, reason in tally.failed.items():
-        text = reason.replace("\n", "\n    ")
-        console.print(f"[red]failed: {name}[/red]\n    {escape(text)}")
+        text = screen(reason).replace("\n", "\n    ")
+        console.print(f"[red]failed: {escape(visible(name))}[/red]\n    {escape(text)}")
     if stopping.is_set():
         console.print("stopped and saved; the same command goes on from here")
         return STOPPED
     if tally.failed and not read_metrics(results):
         return 1  # there is nothing to write yet
     for path in write_all(results, request.tables, benchmark.name, html=True):
-        console.print(f"tables: {path}")
+        console.print(visible(f"tables: {path}"), markup=False)
     return 1 if tally.failed else 0
 
 
