@@ -118,7 +118,7 @@ def latex(text: str) -> str:
 _MARKDOWN = re.compile(
     r"[\\|`*$~]"  # code, emphasis, cells, mathematics, wherever they stand
     r"|(?<![^\W_])_|_(?![^\W_])"  # emphasis, but not within a word
-    r"|(?<=\])[(\[:]"  # what makes a link of brackets
+    r"|(?<=\])[(\[:]|\]$"  # what makes a link of brackets
     r"|^\s*[#+=-](?=\s|$)|^(?<=\d)[.)]"  # headings and lists
 )
 _HTML = {"<": "&lt;", ">": "&gt;"}

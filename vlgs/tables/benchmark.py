@@ -112,12 +112,13 @@ class Benchmark:
                 raise ValueError(
                     f"{path}: {key} must be a list of {expected}, got {briefly(values)}"
                 )
-        return cls(
-            path.parent.name,
-            tuple(content["overrides"]),
-            tuple(map(str, content["scenes"])),
-            tuple(content["seeds"]),
-        )
+        scenes = tuple(map(str, content["scenes"]))
+        try:
+            return cls(
+                path.parent.name, tuple(content["overrides"]), scenes, tuple(content["seeds"])
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 class Composer:

@@ -16,6 +16,7 @@ import yaml
 
 from vlgs.finished import is_number
 from vlgs.tables.quantities import QUANTITIES
+from vlgs.text import visible
 
 _CHECKOUT = Path(__file__).resolve().parents[2] / "sweeps"
 SWEEPS = (
@@ -28,6 +29,9 @@ AVERAGE = "avg"
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The safe loader in C where PyYAML has it: ten times as fast."""
+
+DEEPEST = 100
+"""Lists and mappings in each other that a file may have."""
 
 _TABLE_KEYS = {"label", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
 _ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
@@ -120,7 +124,9 @@ def load_table(path: Path) -> Table:
     _require_keys(where, content, _TABLE_KEYS, {"label", "caption", "dataset", "metrics", "rows"})
     label = _require(where, content, "label", str)
     if label != path.stem:
-        raise ValueError(f"{where}: label must be the file's name {path.stem}, got {label}")
+        raise ValueError(
+            f"{where}: label must be the file's name {path.stem}, got {visible(label)}"
+        )
     if not is_label(label):
         raise ValueError(f"{where}: label must be letters, digits, dots and dashes, got {label!r}")
     metrics = tuple(_require(where, content, "metrics", list, str))
@@ -191,10 +197,27 @@ def read_yaml(path: Path) -> Any:
     Raises:
         ValueError: If it is none; the file is named.
     """
+    content = path.read_bytes()
     try:
-        return _LOADER(path.read_bytes()).get_single_data()
+        if sum(map(content.count, (b"[", b"{", b"- -", b"? ?"))) > DEEPEST:
+            _require_shallow(content)
+        return _LOADER(content).get_single_data()
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: an impossible date
         raise ValueError(f"{path}: must be YAML, got: {error}") from error
+
+
+def _require_shallow(content: bytes) -> None:
+    """Refuse what the parser in C would overrun the stack with.
+
+    Raises:
+        ValueError: If lists and mappings lie too deep in each other.
+    """
+    depth = 0
+    for event in yaml.parse(content, _LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ValueError(f"more than {DEEPEST} lists and mappings in each other")
 
 
 def briefly(content: Any) -> str:

@@ -56,7 +56,7 @@ class RunTable:
 
     def text(self) -> str:
         """Columns for a terminal, however wide it is: paths can be copied."""
-        lines = [self.head, *self._printed(visible)]
+        lines = [list(map(visible, self.head)), *self._printed(visible)]
         widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
         return "\n".join(
             "  ".join(
