@@ -15,6 +15,7 @@ from vlgs.config import CONF, LEVELS, check_targets, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
 from vlgs.data.plausible import plausibility_warnings
+from vlgs.text import screen
 from vlgs.types import IGNORE_ID, Scene, View
 
 _COLMAP = "vlgs.data.colmap.load_scene"
@@ -152,13 +153,13 @@ def print_report(report: Report) -> None:
     """Summary, then errors, then warnings, then the verdict."""
     console = Console(soft_wrap=True, highlight=False, markup=False)
     for line in report.summary:
-        console.print(line)
+        console.print(screen(line))
     wrong = errors(report.faults)
     doubtful = [fault for fault in report.faults if fault.severity == "warning"]
     for fault in (*wrong, *doubtful):
         style = "bold red" if fault.severity == "error" else "yellow"
         console.print(f"{fault.severity:<8}", style=style, end="")
-        console.print(str(fault))
+        console.print(screen(str(fault)))
     verdict = "not usable" if wrong else "usable"
     console.print(f"{verdict}: {len(wrong)} errors, {len(doubtful)} warnings")
 

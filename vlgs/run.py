@@ -24,6 +24,8 @@ from vlgs.config import (
     run_id,
 )
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
+from vlgs.tables.multirun import note_run
+from vlgs.text import screen
 
 log = logging.getLogger(__name__)
 
@@ -37,14 +39,15 @@ def main(config: DictConfig) -> None:
     except (ValueError, OSError, FloatingPointError) as error:
         if not alone:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(screen(f"error: {error}"), file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
         if not alone:
             raise
         print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(STOPPED)
-    if status:
+    several = HydraConfig.get().mode == RunMode.MULTIRUN
+    if status and not (several and status == UNSCORED):  # whose other runs go on
         sys.exit(status)
 
 
@@ -68,6 +71,7 @@ def run(config: DictConfig) -> int:
     read += [file_digest(path, key) for key, path in given.items() if path]
     content = " ".join(filter(None, read))
     folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
+    note_run(folder.path)
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
@@ -86,8 +90,7 @@ def _scenes(config: DictConfig) -> dict[int | None, Any]:
 def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> int:
     finished = folder.finished()
     if finished is not None:
-        log.info("this run exists: %s (nothing was computed)", folder.path)
-        return _say(finished, folder)
+        return _say(finished, folder, "already done, nothing computed")
     from vlgs.module.stages import StoppedError, train_all
 
     text = _text_encoder(config, next(reversed(scenes.values())))
@@ -102,11 +105,11 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
     return _say(_report(folder, config, scenes, models, stages, text), folder)
 
 
-def _say(metrics: dict[str, Any], folder: RunFolder) -> int:
+def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
     """Print a result; the exit status says whether it has the scores that were asked for."""
     from vlgs.report.summary import print_summary
 
-    print_summary(metrics, _places(folder))
+    print_summary(metrics, _places(folder), first=first)
     return UNSCORED if metrics.get("failure") else 0
 
 
@@ -177,7 +180,8 @@ def _report(
         write_ply(stage.folder.ply, stage.model.splats)
     evaluation = evaluate(models, scene, query, text, protocol)
     prompts, _ = prompts_of(scene, query, text)
-    timing = measure_fps(model, [view.camera for view in scene.test or scene.train], query, prompts)
+    cameras, language = [v.camera for v in scene.test or scene.train], len(scene.mask_vectors) > 0
+    timing = measure_fps(model, cameras, query, prompts, language)
     if config.pictures:
         write_pictures(folder.renders, model, scene, query, prompts)
     extra = {

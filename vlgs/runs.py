@@ -6,13 +6,14 @@
 """
 
 import fcntl
-import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from vlgs.finished import read_finished
 
 STOPPED = 130
 """Exit status after Ctrl-C, as shells have it."""
@@ -69,14 +70,9 @@ class RunFolder:
         """The results of a finished run.
 
         Raises:
-            ValueError: If metrics.json is there but is not JSON.
+            ValueError: If metrics.json is there but damaged; it says what to do.
         """
-        if not self.metrics.is_file():
-            return None
-        try:
-            return json.loads(self.metrics.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"run: {self.metrics} must be JSON, got: {error}") from error
+        return read_finished(self.metrics) if self.metrics.is_file() else None
 
     @contextmanager
     def writing(self) -> Iterator[None]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tests import fuzz
 from tests.fuzz.judge import Outcome, run_attack, scratch
+from vlgs.text import screen
 
 COLUMNS = ("family", "tried", "right", "slowest_cpu_s", "largest_mb", "wall_s")
 
@@ -72,7 +73,7 @@ def main() -> None:
             f"{name:<16} tried {len(outcomes):>5}  right {len(outcomes) - len(bad):>5}  {slowest:.1f} s CPU, {largest:.0f} MB at most"
         )
         for number, outcome in bad:
-            print(f"  --only {number}  {outcome.name}: {outcome.said}")
+            print(screen(f"  --only {number}  {outcome.name}: {outcome.said}"))
     if options.write:
         with options.write.open("w", newline="") as file:
             csv.writer(file).writerows([COLUMNS, *rows])

@@ -1,5 +1,6 @@
 """A drawn still life with a model that has learnt it almost: everything a report needs, without a rasterizer."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,10 +31,12 @@ COLORS = torch.tensor(
 EMBEDDING = 16
 
 
-def vocabulary(words: tuple[str, ...] = CLASSES + NEGATIVES) -> Vocabulary:
+def vocabulary(
+    words: tuple[str, ...] = CLASSES + NEGATIVES, renamed: Mapping[str, str] | None = None
+) -> Vocabulary:
     """Words in a narrow cone as CLIP's are; the negatives lie on the cone's axis."""
     rng = torch.Generator().manual_seed(0)
-    rows = {c: i for i, c in enumerate(CLASSES + NEGATIVES)}
+    rows = {(renamed or {}).get(c, c): i for i, c in enumerate(CLASSES + NEGATIVES)}
     vectors = torch.zeros(len(rows), EMBEDDING)
     vectors[:, 0] = 2
     vectors[: len(CLASSES), 1 : len(CLASSES) + 1] = torch.eye(len(CLASSES))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from report_fakes import Drawing, FakeModel, scene, view, with_test
+from report_fakes import CLASSES, NEGATIVES, Drawing, FakeModel, scene, view, vocabulary, with_test
 
 from vlgs.query import LerfRelevancy, Prompts
 from vlgs.query.text import VocabularyText
@@ -16,7 +16,7 @@ from vlgs.report.draw import Painter
 from vlgs.report.evaluate import prompts_of
 from vlgs.report.features import fit_feature_colors, paint_features
 from vlgs.report.overview import count_difference
-from vlgs.report.pictures import PictureLimits, _file_name, spread, write_pictures
+from vlgs.report.pictures import PictureLimits, spread, write_pictures
 from vlgs.types import IGNORE_ID, Scene
 
 QUERY = LerfRelevancy()
@@ -110,11 +110,26 @@ def test_views_are_spread_over_all():
     assert spread([], 8) == []
 
 
-def test_names_become_safe_file_names():
-    assert _file_name("../../etc/passwd") == "_.._etc_passwd"
-    assert _file_name("wine glass") == "wine_glass"
-    assert _file_name("..") == "_"
-    assert _file_name("Gläser") == "Gläser"
+def test_hostile_names_have_pictures_of_their_own(tmp_path: Path):
+    words = ("a b", "a/b", "x" * 300, "_$\\frac$", "A\n\x1b[31mB", "..")
+    still_life = scene(3, width=60, height=40)
+    renamed: dict[str, str] = dict(zip(CLASSES, words, strict=True))
+    names = ("cam0/001", "CON", "cam0\\001")
+    hostile = replace(
+        still_life,
+        classes=words,
+        class_kinds={},
+        vocabulary=vocabulary(words + NEGATIVES, renamed),
+        test=tuple(
+            replace(view, name=name) for view, name in zip(still_life.test, names, strict=True)
+        ),
+    )
+    write_pictures(tmp_path, FakeModel(), hostile, QUERY, prompts(hostile))
+    folders = sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
+    assert len(folders) == 3
+    drawn = {path.name for path in tmp_path.glob("*/relevancy_*.png")}
+    assert len(drawn) == 5  # of six classes one is in no picture
+    assert max(map(len, drawn)) < 130
 
 
 def test_every_picture_of_a_view_is_written(tmp_path: Path):

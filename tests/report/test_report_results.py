@@ -189,3 +189,17 @@ def test_the_summary_says_that_evaluated_views_were_trained_on():
     assert "evaluated views " in printed(3)
     assert "trained on" not in printed(0)
     assert "held-out views" in printed(0)
+
+
+def test_names_of_strangers_are_printed_as_they_are(tmp_path: Path):
+    words = {"[red]": 0.5, "[/]": 0.25, "a\x1b[31mb\nc": 0.125, "\u202egnp": None}
+    hostile = replace(EVALUATION, per_category=words, reasons={"miou": "[bold]\x07"})
+    metrics = write_metrics(tmp_path / "m.json", hostile, {"peak_rss_bytes": 632_270_848})
+    console = Console(width=100, file=io.StringIO())
+    print_summary(metrics, {}, console, first="already done, nothing computed")
+    assert isinstance(console.file, io.StringIO)
+    said = console.file.getvalue()
+    assert said.startswith("already done, nothing computed\n")
+    for text in ("[red] ", "[/] ", r"a\x1b[31mb\nc", r"\u202egnp", r"[bold]\x07", "632 MB"):
+        assert text in said
+    assert not {"\x1b", "\x07", "\u202e"} & set(said)

@@ -93,3 +93,10 @@ def test_only_a_query_that_needs_all_prompts_gets_them(
     cameras = [view.camera for view in scene(1).test]
     timing.measure_fps(TimedModel(clock), cameras, query, prompts(query), repeats=3)
     assert set(seen) == {asked}
+
+
+def test_the_language_of_a_scene_without_any_is_not_timed(clock: Clock):
+    cameras = [view.camera for view in scene(2).test]
+    got = timing.measure_fps(TimedModel(clock), cameras, LerfRelevancy(), None, language=False)
+    assert got.fps_color == pytest.approx(100)
+    assert got.fps_language is got.fps_query is None

@@ -11,14 +11,16 @@ import pandas as pd
 import pytest
 from tables_fakes import fake_runs
 
+from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.fill import Cell, Filled, Place, fill
 from vlgs.tables.frame import by_row, read_metrics, require_one_meaning, tidy, to_lines
 from vlgs.tables.grid import arrange
 from vlgs.tables.html import write_report
-from vlgs.tables.latex import escape, to_latex
+from vlgs.tables.latex import to_latex
 from vlgs.tables.registry import Row, Table, load_table, load_tables
 from vlgs.tables.write import write_all, write_tables
+from vlgs.text import latex as escape
 
 BENCHMARK = Benchmark("synthetic", ("data=synthetic",), ("glassware", "mirrors"), (0, 1))
 
@@ -230,10 +232,32 @@ def test_runs_that_must_not_stand_together_are_refused(table: Table, tmp_path: P
         require_one_meaning(tidy(to_lines([*runs, runs[0] | {"config_hash": "twin"}])))
     with pytest.raises(ValueError, match=r"must share a protocol, got dense@1/synthetic, dense@2"):
         require_one_meaning(tidy(to_lines([*runs[1:], runs[0] | {"protocol": "dense@2"}])))
-    (tmp_path / "runs" / "broken").mkdir()
-    (tmp_path / "runs" / "broken" / "metrics.json").write_text("{")
-    with pytest.raises(ValueError, match=r"broken.metrics\.json: must be JSON"):
-        read_metrics(tmp_path)
+
+
+DAMAGED = {
+    "cut": (lambda text: text[: len(text) // 2], "must be JSON in UTF-8"),
+    "empty": (lambda text: "{}", "config_hash must be a text, got None"),
+    "list": (lambda text: "[]", "content must be an object"),
+    "nested": (lambda text: "[" * 100_000, "endless nesting"),
+    "latin": (lambda text: text.replace("a cpu", "\udcff"), "must be JSON in UTF-8"),
+    "word": (lambda text: text.replace('"psnr": ', '"psnr": "high", "old": '), "psnr must be a finite"),
+    "nan": (lambda text: text.replace('"cup": ', '"cup": NaN, "old": ', 1), "per_category.cup must be"),
+    "seed": (lambda text: text.replace('"seed": ', '"seed": "x", "old": '), "seed must be a whole"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", sorted(DAMAGED))
+def test_a_damaged_run_is_left_out_with_a_warning_that_names_it(
+    table: Table, tmp_path: Path, fault: str, caplog: pytest.LogCaptureFixture
+):
+    count = fake_runs(tmp_path, [table], BENCHMARK, value)
+    path = min(tmp_path.glob("runs/*/metrics.json"))
+    damage, said = DAMAGED[fault]
+    path.write_text(damage(path.read_text()), errors="surrogateescape")
+    assert len(read_metrics(tmp_path)) == count - 1
+    assert f"{path}: {said}" in caplog.text
+    with pytest.raises(ValueError, match=r"delete the file, and the run is reported again"):
+        RunFolder(path.parent).finished()
 
 
 FAULTS = """
@@ -313,7 +337,7 @@ def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Pa
 
     for broken in ("config_hash,value\na,1\n", ""):
         files[0].write_text(broken)
-        with pytest.raises(ValueError, match=r"runs.csv: must be as vlgs.tables writes it"):
+        with pytest.raises(ValueError, match=r"runs.csv: line \d must be as vlgs.tables writes it"):
             write_all(tmp_path, [table])
     files[0].write_bytes(before[0].replace(b",0,dense@1", b",first,dense@1"))
     with pytest.raises(ValueError, match=r"runs.csv: must be as .*first"):

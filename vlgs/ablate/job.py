@@ -6,6 +6,8 @@ folder: the job writes how it goes (`<number>.json`), and ends early when a file
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
@@ -104,7 +106,7 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
         return
     record(None)
     with log.open("w") as file:
-        file.write(" ".join(command) + "\n")
+        file.write(shlex.join(command) + "\n")
         file.flush()
         # A session of its own: Ctrl-C in a terminal reaches it once, as the SIGTERM below, and it saves its step.
         with subprocess.Popen(
@@ -138,4 +140,5 @@ def _title(overrides: Sequence[str]) -> str:
     """Name of the log: the row, scene and seed, without places and what moves no number."""
     words = [o for o in overrides if not o.startswith(("results=", "hydra", "threads="))]
     name = "_".join(word.replace("data.", "").replace("/", "-") for word in words)
-    return name[-120:].lstrip("_.")  # what tells rows apart stands last
+    safe = re.sub(r"[^\w=.,+@-]+", "_", name).encode()[-120:].decode(errors="ignore")
+    return safe.lstrip("_.")  # what tells rows apart stands last

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vlgs.report import colors
 from vlgs.report.draw import ViewPictures
+from vlgs.text import plot
 from vlgs.types import Scene
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ class _Sheet:
 
     def _text(self, x: float, y: float, text: str, size: int, rotation: int = 0) -> None:
         self.figure.text(
-            x / self.width, 1 - y / self.height, text,
+            x / self.width, 1 - y / self.height, plot(text),
             fontsize=size, rotation=rotation, ha="center", va="center",
         )  # fmt: skip
 
@@ -152,7 +153,7 @@ class _Sheet:
         from matplotlib.patches import Patch
 
         palette = (colors.label_colors(len(scene.classes)).double() / 255).numpy()
-        handles = [Patch(color=palette[i], label=scene.classes[i]) for i in classes]
+        handles = [Patch(color=palette[i], label=plot(scene.classes[i])) for i in classes]
         if handles:
             self.figure.legend(
                 handles=handles, loc="upper left", ncols=columns, frameon=False, fontsize=8,
@@ -175,7 +176,7 @@ def _draw_tile(axes: "Axes", tile: _Tile) -> None:
     axes.set_axis_off()
     if tile.caption:
         axes.text(
-            0.03, 0.05, tile.caption, transform=axes.transAxes, color="white", fontsize=8,
+            0.03, 0.05, plot(tile.caption), transform=axes.transAxes, color="white", fontsize=8,
             path_effects=[withStroke(linewidth=2, foreground="black")],
         )  # fmt: skip
 

@@ -1,7 +1,6 @@
 """Picture files of a run: a folder per held-out view, a histogram and one sheet that shows them together."""
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -9,6 +8,7 @@ from typing import TypeVar
 from jaxtyping import UInt8
 from torch import Tensor
 
+from vlgs.names import file_names
 from vlgs.query import Prompts, Query
 from vlgs.report.answer import ViewModel
 from vlgs.report.draw import Painter, ViewPictures
@@ -57,12 +57,15 @@ def write_pictures(
         return None
     folder.mkdir(parents=True, exist_ok=True)
     painter = Painter(model, scene, query, prompts, views)
+    # Of all views and prompts, so that a view and a prompt have one name however few are drawn.
+    folders = file_names(view.name for view in scene.test)
+    names = file_names(prompts.names if prompts is not None else ())
     rows: list[ViewPictures] = []
     on_overview = {view.name for view in spread(views, limits.rows)}
     # Those of the overview first: the painter gives a prompt that was not shown yet to each view in turn.
     for view in sorted(views, key=lambda view: view.name not in on_overview):
         pictures = painter.draw(view, limits.prompts)
-        write_view(folder / _file_name(view.name), pictures)
+        write_view(folder / folders[view.name], pictures, names)
         if view.name in on_overview:
             rows.append(pictures)
     density = count_difference(painter.fused.language_weight, painter.fused.gaussians.opacities)
@@ -73,8 +76,14 @@ def write_pictures(
     return path
 
 
-def write_view(folder: Path, pictures: ViewPictures) -> None:
-    """Every picture of one view at its own size."""
+def write_view(folder: Path, pictures: ViewPictures, names: Mapping[str, str]) -> None:
+    """Every picture of one view at its own size.
+
+    Args:
+        folder: Made if needed.
+        pictures: Of the view.
+        names: Prompt -> its name on disk.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     named = {
         "photograph": pictures.photograph,
@@ -85,8 +94,8 @@ def write_view(folder: Path, pictures: ViewPictures) -> None:
         "prediction": pictures.prediction,
     }
     for prompt, answer in pictures.prompts.items():
-        named[f"relevancy_{_file_name(prompt)}"] = answer.relevancy
-        named[f"segmentation_{_file_name(prompt)}"] = answer.segmentation
+        named[f"relevancy_{names[prompt]}"] = answer.relevancy
+        named[f"segmentation_{names[prompt]}"] = answer.segmentation
     for name, picture in named.items():
         if picture is not None:
             _save(folder / f"{name}.png", picture)
@@ -96,11 +105,6 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     """At most `count` items at even distances, the first among them, in order."""
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
-
-
-def _file_name(text: str) -> str:
-    """A word or view name as a safe file name."""
-    return re.sub(r"[^\w.-]+", "_", text).strip(".") or "_"
 
 
 def _save(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:

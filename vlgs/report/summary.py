@@ -9,6 +9,8 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from vlgs.text import screen, visible
+
 _ROWS = (
     ("psnr", "PSNR", "{:.2f} dB"),
     ("ssim", "SSIM", "{:.4f}"),
@@ -23,7 +25,7 @@ _ROWS = (
     ("loc_acc_lerf_ovs_ceiling", "  of exact features", "{:.1%}"),
     ("n_gaussians", "Gaussians", "{:,}"),
     ("train_seconds", "training", "{:.1f} s"),
-    ("peak_rss_bytes", "peak memory", "{:,} B"),
+    ("peak_rss_bytes", "peak memory", "{:,} MB"),
     ("fps_color", "colour render", "{:.1f} /s"),
     ("fps_language", "language render", "{:.1f} /s"),
     ("fps_query", "query", "{:.1f} /s"),
@@ -45,28 +47,38 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     for name, label, form in _ROWS:
         value = metrics.get(name)
         if value is not None:
+            value = round(value / 1e6) if name.endswith("_bytes") else value
             table.add_row(label, form.format(value))
         elif name in _ALWAYS:
             table.add_row(label, "--")
     per_category = metrics.get("per_category") or {}
     for category, iou in per_category.items():
-        table.add_row(Text(f"  {category}"), "--" if iou is None else f"{iou:.1%}", style="dim")
+        table.add_row(
+            Text(visible(f"  {category}")), "--" if iou is None else f"{iou:.1%}", style="dim"
+        )
     for name, entry in (metrics.get("skips") or {}).items():
-        table.add_row(Text(f"  skipped: {name}"), _skipped(entry), style="dim")
-    reasons = {name: why for name, why in metrics["reasons"].items() if name not in _SILENT}
-    notes = [Text(f"{name}: {why}", style="yellow") for name, why in reasons.items()]
+        table.add_row(Text(visible(f"  skipped: {name}")), _skipped(entry), style="dim")
+    reasons = {
+        name: why for name, why in (metrics.get("reasons") or {}).items() if name not in _SILENT
+    }
+    notes = [_text(f"{name}: {why}", style="yellow") for name, why in reasons.items()]
     if metrics.get("failure"):
-        notes.append(Text(f"failed: {metrics['failure']}", style="bold red"))
+        notes.append(_text(f"failed: {metrics['failure']}", style="bold red"))
     if seen:
         told = f"{seen} of {views} evaluated views were trained on: these are not held-out scores"
         notes.append(Text(told, style="yellow"))
     width = max((len(label) for label in paths), default=0)
-    places = [Text(f"{label:<{width}}  {path}") for label, path in paths.items()]
-    told = [f"protocol: {metrics['protocol']}"]
+    places = [_text(f"{label:<{width}}  {path}") for label, path in paths.items()]
+    told = [f"protocol: {metrics.get('protocol')}"]
     if metrics.get("levels"):
-        several = f" ({metrics['level_models']})" if len(metrics["levels"]) > 1 else ""
+        several = f" ({metrics.get('level_models')})" if len(metrics["levels"]) > 1 else ""
         told.append(f"mask levels: {', '.join(map(str, metrics['levels']))}{several}")
-    return Group(table, *notes, *map(Text, told), *places)
+    return Group(table, *notes, *map(_text, told), *places)
+
+
+def _text(text: str, style: str = "") -> Text:
+    """Words of a run as they are: neither rich's markup nor a terminal's control characters count in them."""
+    return Text(screen(text), style=style)
 
 
 def _skipped(entry: Mapping[str, Any]) -> str:
@@ -77,7 +89,13 @@ def _skipped(entry: Mapping[str, Any]) -> str:
 
 
 def print_summary(
-    metrics: Mapping[str, Any], paths: Mapping[str, Path], console: Console | None = None
+    metrics: Mapping[str, Any],
+    paths: Mapping[str, Path],
+    console: Console | None = None,
+    first: str = "",
 ) -> None:
-    """Print `summary`; paths are never wrapped, so that they can be copied."""
-    (console or Console()).print(summary(metrics, paths), soft_wrap=True)
+    """Print `summary`, under a first line if there is one; paths are never wrapped, so that they can be copied."""
+    console = console or Console()
+    if first:
+        console.print(_text(first), soft_wrap=True)
+    console.print(summary(metrics, paths), soft_wrap=True)

@@ -31,6 +31,7 @@ def measure_fps(
     cameras: Sequence[Camera],
     query: Query,
     prompts: Prompts | None,
+    language: bool = True,
     seconds: float = 5.0,
     repeats: int = 100,
 ) -> Timing:
@@ -44,6 +45,7 @@ def measure_fps(
         cameras: Usually those of the held-out views.
         query: How relevancy is computed.
         prompts: The scene's classes; without them queries are not timed.
+        language: Whether the scene has language; the render of what was never trained is not timed.
         seconds: Budget for all three figures together. It ends a measurement early, but never before three views.
         repeats: Views per figure within the budget.
     """
@@ -60,15 +62,14 @@ def measure_fps(
         assert answer.negatives is not None
         query.relevancy(answer.cosines, answer.negatives)
 
-    fps_query = None
+    fps_language = fps_query = None
+    if language:
+        fps_language = fps(lambda camera: model.render(camera, color=False, fused=fused))
     if prompts is not None:
         one = prompts if query.needs_all_prompts else _first(prompts)
         fps_query = fps(lambda camera: ask(camera, one))
-    return Timing(
-        fps_color=fps(lambda camera: model.render(camera, language=False, fused=fused)),
-        fps_language=fps(lambda camera: model.render(camera, color=False, fused=fused)),
-        fps_query=fps_query,
-    )
+    fps_color = fps(lambda camera: model.render(camera, language=False, fused=fused))
+    return Timing(fps_color, fps_language, fps_query)
 
 
 def _median_seconds(

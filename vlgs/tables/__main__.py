@@ -4,6 +4,8 @@
     python -m vlgs.tables tab=ab-multi     one table; several: tab=ab-multi,ab-cam
     python -m vlgs.tables results=FOLDER   other than ./results
     python -m vlgs.tables html=true        index.html with plots too
+    python -m vlgs.tables FOLDER           one line for each run of any folder of runs: what differs, scores, where it lies
+    python -m vlgs.tables FOLDER write=F   the same to a file F.csv or F.md
 
 Writes results/runs.csv (one row per run, metric and category; runs.parquet with pyarrow), and per benchmark <label>.csv, .md and
 .tex, and tables.tex over all of them. Nothing is trained, and nothing that has no run is filled in. Runs that stand in runs.csv and have
@@ -12,11 +14,14 @@ no folder here, as in a fresh clone, stay; delete the file to leave them out.
 
 import gc
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from vlgs.config import split_override
 from vlgs.tables.registry import choose, load_tables
+from vlgs.tables.runs import compare, read_runs
 from vlgs.tables.write import write_all
+from vlgs.text import screen
 
 
 def main() -> None:
@@ -24,11 +29,17 @@ def main() -> None:
     if len(sys.argv) > 1 and sys.argv[1] in ("-h", "--help"):
         print(__doc__)
         return
-    given = dict(map(split_override, sys.argv[1:]))
+    folder = sys.argv[1] if len(sys.argv) > 1 and Path(sys.argv[1]).is_dir() else ""
+    given = dict(map(split_override, sys.argv[2 if folder else 1 :]))
     try:
+        if folder:
+            _compare(Path(folder), given)
+            return
         unknown = sorted(set(given) - {"tab", "results", "html"})
         if unknown:
-            raise ValueError(f"tables: arguments must be tab=, results= or html=, got {unknown[0]}")
+            raise ValueError(
+                f"tables: arguments must be tab=, results=, html= or a folder of runs, got {unknown[0]}"
+            )
         if given.get("html", "false") not in ("true", "false"):
             raise ValueError(f"tables: html must be true or false, got {given['html']}")
         tables = choose(given.get("tab", "all").split(","), load_tables())
@@ -36,7 +47,17 @@ def main() -> None:
         for path in write_all(results, tables, html=html):
             print(path)
     except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(screen(f"error: {error}"))
+
+
+def _compare(folder: Path, given: Mapping[str, str]) -> None:
+    """One line per run of a folder."""
+    if unknown := sorted(set(given) - {"write"}):
+        raise ValueError(f"tables: with a folder, arguments must be write=, got {unknown[0]}")
+    table = compare(read_runs(folder))
+    print(table.text())
+    if "write" in given:
+        table.write(Path(given["write"]))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,9 @@ from vlgs.config import (
     identity,
 )
 from vlgs.files import write_atomically, write_changed
+from vlgs.tables.registry import briefly, read_yaml
+
+log = logging.getLogger(__name__)
 
 
 class UnknownOptionError(ValueError):
@@ -46,7 +50,11 @@ class Benchmark:
                 raise ValueError(
                     f"ablate: {name} must be given, each once, got {', '.join(map(str, values)) or 'none'}"
                 )
-        if not self.name or Path(self.name).name != self.name:
+        if (
+            Path(self.name).name != self.name
+            or self.name in ("", "..")
+            or not self.name.isprintable()
+        ):
             raise ValueError(f"ablate: name must be a folder's name, got {self.name!r}")
 
     @property
@@ -90,15 +98,27 @@ class Benchmark:
         Raises:
             ValueError: Names the file and what it must hold.
         """
-        content = yaml.safe_load(path.read_text())
+        content = read_yaml(path)
         if not isinstance(content, dict) or set(content) != {"overrides", "scenes", "seeds"}:
-            raise ValueError(f"{path}: must hold overrides, scenes and seeds, got {content!r}")
-        return cls(
-            path.parent.name,
-            tuple(content["overrides"]),
-            tuple(map(str, content["scenes"])),
-            tuple(content["seeds"]),
-        )
+            raise ValueError(
+                f"{path}: must hold overrides, scenes and seeds, got {briefly(content)}"
+            )
+        for key, kinds in (("overrides", str), ("scenes", (str, int)), ("seeds", int)):
+            values = content[key]
+            if not isinstance(values, list) or not all(
+                isinstance(v, kinds) and not isinstance(v, bool) for v in values
+            ):
+                expected = "whole numbers" if key == "seeds" else "texts"
+                raise ValueError(
+                    f"{path}: {key} must be a list of {expected}, got {briefly(values)}"
+                )
+        scenes = tuple(map(str, content["scenes"]))
+        try:
+            return cls(
+                path.parent.name, tuple(content["overrides"]), scenes, tuple(content["seeds"])
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 class Composer:
@@ -162,11 +182,24 @@ def _read_rows(path: Path | None, head: Mapping[str, Any]) -> dict[str, dict[str
     if path is None or not path.is_file():
         return {}
     try:
-        content = json.loads(path.read_text())
-    except json.JSONDecodeError:
-        return {}  # only a cache
-    same = isinstance(content, dict) and {key: content.get(key) for key in head} == head
-    return content.get("rows", {}) if same else {}
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        # Only a cache: it is made again.
+        log.warning("%s: must be JSON, got: %s; the rows are composed anew", path, error)
+        return {}
+    if not isinstance(content, dict) or {key: content.get(key) for key in head} != head:
+        return {}
+    rows = content.get("rows")
+    if isinstance(rows, dict) and all(map(_is_row, rows.values())):
+        return rows
+    log.warning("%s: rows must say what each row is; they are composed anew", path)
+    return {}
+
+
+def _is_row(content: Any) -> bool:
+    if not isinstance(content, dict) or set(content) not in ({"recipe", "data"}, {"refused"}):
+        return False
+    return all(isinstance(value, str) for value in content.values())
 
 
 def _tree_digest() -> str:

@@ -1,7 +1,7 @@
 """Finished runs as one tidy frame: a line per run, metric and category."""
 
 import csv
-import json
+import io
 import logging
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from vlgs.files import write_atomically, write_changed
+from vlgs.finished import read_finished
+from vlgs.text import csv_cell, csv_line, csv_text, screen, to_bytes
 
 log = logging.getLogger(__name__)
 
@@ -46,17 +48,13 @@ DETAILS = {"per_category", "category_kinds", "indicator", "per_view", "reasons",
 
 
 def read_metrics(results: Path) -> list[dict[str, Any]]:
-    """Contents of metrics.json of every finished run below `results`/runs.
-
-    Raises:
-        ValueError: If a file is not JSON; it is named.
-    """
+    """Contents of metrics.json of every finished run below `results`/runs; one that is damaged is left out, with a warning."""
     runs = []
     for path in sorted((results / "runs").glob("*/metrics.json")):
         try:
-            runs.append(json.loads(path.read_text()))
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: must be JSON, got: {error}") from error
+            runs.append(read_finished(path))
+        except (ValueError, OSError) as error:
+            log.warning("%s", screen(f"this run is left out: {error}"))
     return runs
 
 
@@ -97,16 +95,31 @@ def read_lines(results: Path, without: Collection[str] = ()) -> list[Line]:
     path = results / "runs.csv"
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        rows = csv.reader(file)
+    content = path.read_bytes()
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as error:
+        number = content.count(b"\n", 0, error.start) + 1
+        raise ValueError(_damaged(path, number, "bytes that are not UTF-8")) from error
+    rows = csv.reader(io.StringIO(text, newline=""), strict=True)
+    marked = "'" in text  # else no text was marked as one, which is quickly seen
+    try:
         head = next(rows, [])
-        try:
-            if tuple(head) != Line._fields:
-                raise ValueError(f"columns {', '.join(head) or 'none'}")
-            return [_line(*row) for row in rows if row[0] not in without]
-        except (IndexError, TypeError, ValueError) as error:
-            what = f"must be as vlgs.tables writes it, or not be there, got: {error}"
-            raise ValueError(f"{path}: {what}") from error
+        if tuple(head) != Line._fields:
+            raise ValueError(f"columns {', '.join(head) or 'none'}")
+        if marked:
+            return [_line(*map(csv_text, row)) for row in rows if csv_text(row[0]) not in without]
+        return [_line(*row) for row in rows if row[0] not in without]
+    except (IndexError, TypeError, ValueError, csv.Error) as error:
+        said = "too few or too many cells" if isinstance(error, (IndexError, TypeError)) else error
+        raise ValueError(_damaged(path, rows.line_num, said)) from error
+
+
+def _damaged(path: Path, line: int, got: object) -> str:
+    return screen(
+        f"{path}: line {line} must be as vlgs.tables writes it, got {got!s:.200}; take the file from version control, or delete it "
+        "to leave out runs that have no folder here"
+    )
 
 
 def add_kept(found: Sequence[Line], results: Path) -> list[Line]:
@@ -135,10 +148,13 @@ def _place(line: Line) -> tuple[str, str, str, int]:
 
 def _line(*row: str) -> Line:
     line = Line(*row)  # pyright: ignore[reportArgumentType]
+    value = float(line.value) if line.value else math.nan
+    if line.value and not math.isfinite(value):
+        raise ValueError(f"value {line.value}")
     return line._replace(
         seed=int(line.seed),
         results_version=int(line.results_version),
-        value=float(line.value or "nan"),
+        value=value,
         **{name: getattr(line, name) or None for name in ("protocol", "commit", "cpu")},
     )
 
@@ -162,7 +178,14 @@ def _number(value: Any) -> float:
 
 def write_frame(frame: pd.DataFrame, results: Path) -> None:
     """Write runs.csv, and runs.parquet where pyarrow is installed."""
-    write_changed(results / "runs.csv", frame.to_csv(index=False).encode())
+    cells: list[Sequence[str]] = []
+    for name in frame.columns:
+        column = frame[name].tolist()
+        # A text stands in thousands of lines: it is made a cell once.
+        known = {} if name == "value" else {value: csv_cell(value) for value in set(column)}
+        cells.append([known[value] if known else csv_cell(value) for value in column])
+    lines = [csv_line(frame.columns), *map(",".join, zip(*cells, strict=True)), ""]
+    write_changed(results / "runs.csv", to_bytes("\n".join(lines)))
     try:
         parquet = frame.to_parquet(index=False)
     except ImportError:

@@ -15,6 +15,7 @@ from vlgs.tables.fill import Filled
 from vlgs.tables.frame import Line
 from vlgs.tables.grid import arrange, caption, has_paper, number
 from vlgs.tables.statistics import sentence
+from vlgs.text import to_bytes, visible
 
 
 def write_report(
@@ -53,9 +54,12 @@ def write_report(
             plots.indicator_by_kind(_histograms(full, results)),
         ),
     ]
-    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
-        resources.files("vlgs.tables").joinpath("report.html.j2").read_text()
-    )
+    page = Environment(
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: visible(value) if isinstance(value, str) else value,
+    ).from_string(resources.files("vlgs.tables").joinpath("report.html.j2").read_text())
     text = page.render(
         name=folder.name,
         tables=[
@@ -64,7 +68,7 @@ def write_report(
         whole=[(title, keep(name, png)) for title, name, png in whole if png is not None],
         provenance=filled[0].provenance if filled else [],
     )
-    write_atomically(folder / "index.html", text.encode())
+    write_atomically(folder / "index.html", to_bytes(text))
 
 
 def _section(filled: Filled, picture: str) -> dict[str, Any]:

@@ -14,34 +14,13 @@ from vlgs.tables.grid import (
     has_paper,
     number,
 )
-
-_SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
+from vlgs.text import latex as escape
+from vlgs.text import visible
 
 PREAMBLE = r"""\documentclass{article}
 \usepackage[a4paper,landscape,margin=15mm]{geometry}
 \usepackage{amssymb,booktabs,multirow,graphicx}
 """
-
-
-def escape(text: str) -> str:
-    r"""Plain text for LaTeX.
-
-    Example:
-        >>> escape("50% of sake_cup +- 1")
-        '50\\% of sake\\_cup $\\pm$ 1'
-    """
-    return "".join(_SPECIAL.get(c, c) for c in text).replace("+-", r"$\pm$")
 
 
 def to_latex(filled: Filled) -> str:
@@ -57,7 +36,7 @@ def to_latex(filled: Filled) -> str:
     rows = _with_groups(grid, body, grouped)
     return "\n".join(
         [
-            *(f"% {line}" for line in filled.provenance),
+            *(f"% {visible(line)}" for line in filled.provenance),
             r"\begin{table}[htbp]",
             r"\centering",
             rf"\caption{{{escape(caption(filled))}}}",

@@ -2,36 +2,42 @@
 
 import math
 
-import pandas as pd
-
 from vlgs.tables.fill import Cell, Filled, Place
 from vlgs.tables.grid import Entry, arrange, caption, has_paper, number
 from vlgs.tables.statistics import sentence
+from vlgs.text import csv_line, visible
+from vlgs.text import markdown as escape
 
 
 def to_markdown(filled: Filled) -> str:
     """Caption, table, what it says about the paper's claims, and where the numbers come from."""
     grid, paper = arrange(filled), has_paper(filled)
     grouped = any(line.group for line in grid.lines)
-    head = [*([""] if grouped else []), "", *grid.mark_names, *grid.headers]
+    head = [*([""] if grouped else []), "", *map(escape, (*grid.mark_names, *grid.headers))]
     rows = [head, ["---"] * len(head)]
     for line in grid.lines:
         marks = ["yes" if mark else "no" for mark in line.marks]
         marks += [""] * (len(grid.mark_names) - len(marks))
         cells = [_cell(entry, paper) for entry in line.entries]
-        rows.append([*([line.group] if grouped else []), line.label, *marks, *cells])
+        rows.append(
+            [*([escape(line.group)] if grouped else []), escape(line.label), *marks, *cells]
+        )
     table = "\n".join("| " + " | ".join(row) + " |" for row in rows)
-    said = [] if filled.table.by_category else [sentence(filled, m) for m in filled.table.metrics]
-    notes = [f"- {row.label}: {row.ours}" for row in filled.table.rows if row.ours]
+    said = (
+        []
+        if filled.table.by_category
+        else [escape(sentence(filled, m)) for m in filled.table.metrics]
+    )
+    notes = [f"- {escape(row.label)}: {escape(row.ours)}" for row in filled.table.rows if row.ours]
     return (
         "\n\n".join(
             [
                 f"# tab:{filled.table.label}",
-                caption(filled),
+                escape(caption(filled)),
                 table,
                 *said,
                 *notes,
-                "\n".join(filled.provenance),
+                "\n".join(map(escape, filled.provenance)),
             ]
         )
         + "\n"
@@ -45,9 +51,9 @@ def to_csv(filled: Filled) -> str:
         (rows[place.row].group, rows[place.row].label, place.column, place.metric, *cell)
         for place, cell in filled.cells.items()
     ]
-    columns = pd.Index(("group", "label", *Place._fields[1:], *Cell._fields))
-    body = pd.DataFrame(cells, columns=columns).to_csv(index=False, float_format="%.4f")
-    return "".join(f"# {line}\n" for line in filled.provenance) + body
+    head = ("group", "label", *Place._fields[1:], *Cell._fields)
+    lines = [f"# {visible(line)}" for line in filled.provenance]
+    return "\n".join([*lines, *(csv_line(row, digits=4) for row in [head, *cells]), ""])
 
 
 def _cell(entry: Entry, paper: bool) -> str:

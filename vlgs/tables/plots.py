@@ -15,6 +15,7 @@ from vlgs.tables.fill import Filled
 from vlgs.tables.grid import Line, arrange
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE
+from vlgs.text import plot
 
 STYLE: Mapping[Any, Any] = {
     "font.size": 8,
@@ -77,7 +78,7 @@ def time_against_score(frame: pd.DataFrame, labels: Mapping[str, str]) -> bytes 
             color = COLORS[index % len(COLORS)]
             axes.plot(row["train_seconds"], 100 * row["miou"], "o", color=color, markersize=4)
             axes.annotate(
-                labels.get(str(recipe), str(recipe)),
+                plot(labels.get(str(recipe), str(recipe))),
                 (row["train_seconds"], 100 * row["miou"]),
                 xytext=(4, 3),
                 textcoords="offset points",
@@ -104,7 +105,7 @@ def learning_curves(curves: Mapping[str, Sequence[pd.DataFrame]]) -> bytes | Non
                     run["psnr"],
                     color=COLORS[index % len(COLORS)],
                     linewidth=0.8,
-                    label=scene if number == 0 else None,
+                    label=plot(scene) if number == 0 else None,
                 )
         axes.set_xlabel("iteration")
         axes.set_ylabel("PSNR of the training views (dB)")
@@ -125,8 +126,9 @@ def indicator_by_kind(histograms: Sequence[Mapping[str, Sequence[float]]]) -> by
     with _png(6.4, 2.6) as (axes, file):
         for index, kind in enumerate(kinds):
             rows = pd.DataFrame([one[kind] for one in histograms if kind in one])
-            name = kind.replace("_", " or ")
-            axes.stairs(rows.mean().to_numpy(), edges, color=COLORS[index], label=name)
+            name = plot(kind.replace("_", " or "))
+            color = COLORS[index % len(COLORS)]
+            axes.stairs(rows.mean().to_numpy(), edges, color=color, label=name)
         axes.set_xlabel("l - o")
         axes.set_ylabel("share of pixels")
         axes.set_yscale("log")
@@ -156,7 +158,7 @@ def _draw(axes: Axes, lines: Sequence[Line], series: Sequence[int], headers: Seq
             markersize=4,
             elinewidth=0.8,
             color=COLORS[number % len(COLORS)],
-            label=headers[index],
+            label=plot(headers[index]),
         )
     axes.set_yticks(range(len(lines)), [_title(line) for line in lines])
     axes.invert_yaxis()
@@ -165,4 +167,4 @@ def _draw(axes: Axes, lines: Sequence[Line], series: Sequence[int], headers: Seq
 
 def _title(line: Line) -> str:
     letter, colon, _ = line.group.partition(":")
-    return f"{letter}: {line.label}" if colon else line.label
+    return plot(f"{letter}: {line.label}" if colon else line.label)

@@ -5,6 +5,7 @@ stand in for a run. `sweeps/README.md` describes every key.
 """
 
 import importlib.resources
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Any
 
 import yaml
 
+from vlgs.finished import is_number
 from vlgs.tables.quantities import QUANTITIES
+from vlgs.text import visible
 
 _CHECKOUT = Path(__file__).resolve().parents[2] / "sweeps"
 SWEEPS = (
@@ -26,6 +29,9 @@ AVERAGE = "avg"
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The safe loader in C where PyYAML has it: ten times as fast."""
+
+DEEPEST = 100
+"""Lists and mappings in each other that a file may have."""
 
 _TABLE_KEYS = {"label", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
 _ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
@@ -76,6 +82,11 @@ class Table:
         return tuple(row for row in self.rows if row.overrides is not None)
 
 
+def is_label(text: str) -> bool:
+    """Whether a text may be a label: it is a file's name and goes into LaTeX as it is."""
+    return re.fullmatch(r"\w[\w.-]*", text, re.ASCII) is not None
+
+
 def load_tables(folder: Path = SWEEPS) -> dict[str, Table]:
     """Read the whole registry, sorted by label.
 
@@ -109,35 +120,39 @@ def load_table(path: Path) -> Table:
     Raises:
         ValueError: Names the file, the key and what it must be.
     """
-    try:
-        content = _LOADER(path.read_text()).get_single_data()
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: must be YAML, got: {error}") from error
-    where = str(path)
+    content, where = read_yaml(path), str(path)
     _require_keys(where, content, _TABLE_KEYS, {"label", "caption", "dataset", "metrics", "rows"})
-    if content["label"] != path.stem:
+    label = _require(where, content, "label", str)
+    if label != path.stem:
         raise ValueError(
-            f"{where}: label must be the file's name {path.stem}, got {content['label']}"
+            f"{where}: label must be the file's name {path.stem}, got {visible(label)}"
         )
-    metrics = tuple(content["metrics"])
+    if not is_label(label):
+        raise ValueError(f"{where}: label must be letters, digits, dots and dashes, got {label!r}")
+    metrics = tuple(_require(where, content, "metrics", list, str))
     for metric in metrics:
         if metric not in QUANTITIES:
             raise ValueError(f"{where}: metrics must be of {', '.join(QUANTITIES)}, got {metric!r}")
-    if content.get("by", "scene") not in ("scene", "category"):
-        raise ValueError(f"{where}: by must be scene or category, got {content['by']!r}")
-    by_category = content.get("by") == "category"
-    kinds = content.get("categories", {})
-    columns = set(kinds) if by_category else {*content.get("scenes", {}), AVERAGE}
+    if not metrics:
+        raise ValueError(f"{where}: metrics must be at least 1, got none")
+    by = _require(where, content, "by", str)
+    if by not in ("", "scene", "category"):
+        raise ValueError(f"{where}: by must be scene or category, got {by!r}")
+    by_category = by == "category"
+    kinds = _require(where, content, "categories", dict, str)
+    scenes = _require(where, content, "scenes", dict, str)
+    columns = set(kinds) if by_category else {*scenes, AVERAGE}
     rows = tuple(
-        _row(f"{where}: rows[{i}]", row, metrics, columns) for i, row in enumerate(content["rows"])
+        _row(f"{where}: rows[{i}]", row, metrics, columns)
+        for i, row in enumerate(_require(where, content, "rows", list, dict))
     )
     if not rows:
         raise ValueError(f"{where}: rows must be at least 1, got none")
     return Table(
-        label=content["label"],
-        caption=content["caption"],
-        dataset=content["dataset"],
-        scenes=content.get("scenes", {}),
+        label=label,
+        caption=_require(where, content, "caption", str),
+        dataset=_require(where, content, "dataset", str),
+        scenes=scenes,
         metrics=metrics,
         rows=rows,
         by_category=by_category,
@@ -149,38 +164,93 @@ def _row(where: str, content: Any, metrics: tuple[str, ...], columns: set[str]) 
     _require_keys(where, content, _ROW_KEYS, {"label"})
     if ("set" in content) == ("method" in content):
         raise ValueError(f"{where}: must have either set or method, got keys {sorted(content)}")
-    overrides = content.get("set")
-    if overrides is not None and not (
-        isinstance(overrides, list) and all(isinstance(o, str) for o in overrides)
-    ):
-        raise ValueError(f"{where}: set must be a list of Hydra overrides, got {overrides!r}")
+    overrides = _require(where, content, "set", list, str) if "set" in content else None
     paper: dict[str, dict[str, float]] = {}
-    for column, value in content.get("paper", {}).items():
+    for column, value in _require(where, content, "paper", dict).items():
         if column not in columns:
-            raise ValueError(
-                f"{where}: paper must have columns of {', '.join(sorted(columns))}, got {column!r}"
-            )
+            known = ", ".join(sorted(columns))
+            raise ValueError(f"{where}: paper must have columns of {known}, got {briefly(column)}")
         values = value if isinstance(value, dict) else {metrics[0]: value}
         for metric, number in values.items():
-            if metric not in metrics or not isinstance(number, (int, float)):
+            if metric not in metrics or not is_number(number):
                 raise ValueError(
-                    f"{where}: paper must give numbers for {', '.join(metrics)}, got {metric}: {number!r}"
+                    f"{where}: paper must give numbers for {', '.join(metrics)}, got {metric}: {briefly(number)}"
                 )
         paper[column] = {metric: float(number) for metric, number in values.items()}
+    label = content["label"]
+    if not isinstance(label, str) and not is_number(label):
+        raise ValueError(f"{where}: label must be a text, got {briefly(label)}")
     return Row(
-        label=str(content["label"]),
+        label=str(label),
         overrides=None if overrides is None else tuple(overrides),
-        method=content.get("method", ""),
-        group=content.get("group", ""),
-        marks=content.get("marks", {}),
+        method=_require(where, content, "method", str),
+        group=_require(where, content, "group", str),
+        marks=_require(where, content, "marks", dict, bool),
         paper=paper,
-        ours=content.get("ours", ""),
+        ours=_require(where, content, "ours", str),
     )
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a small YAML file.
+
+    Raises:
+        ValueError: If it is none; the file is named.
+    """
+    content = path.read_bytes()
+    try:
+        if sum(map(content.count, (b"[", b"{", b"- -", b"? ?"))) > DEEPEST:
+            _require_shallow(content)
+        return _LOADER(content).get_single_data()
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: an impossible date
+        raise ValueError(f"{path}: must be YAML, got: {error}") from error
+
+
+def _require_shallow(content: bytes) -> None:
+    """Refuse what the parser in C would overrun the stack with.
+
+    Raises:
+        ValueError: If lists and mappings lie too deep in each other.
+    """
+    depth = 0
+    for event in yaml.parse(content, _LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ValueError(f"more than {DEEPEST} lists and mappings in each other")
+
+
+def briefly(content: Any) -> str:
+    """A value for an error; a small file can hold a list that is very large in print."""
+    if isinstance(content, (list, dict)):
+        return f"a {type(content).__name__} of {len(content)}"
+    text = repr(content)
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
+def _require(
+    where: str, content: dict[Any, Any], key: str, kind: type, inner: type | None = None
+) -> Any:
+    """An entry, or an empty one of its kind where there is none; `inner` is the kind of what it holds, keys are texts."""
+    value = content.get(key, kind())
+    if isinstance(value, kind):
+        inside = value.values() if isinstance(value, dict) else value if inner else ()
+        odd = [v for v in inside if inner and not isinstance(v, inner)]
+        odd += [k for k in value if not isinstance(k, str)] if isinstance(value, dict) else []
+        if not odd:
+            return value
+        value = odd[0]
+    words = {str: "text", list: "list", dict: "mapping", bool: "true or false"}
+    of = f" of {words[inner]}" if inner else ""
+    raise ValueError(f"{where}: {key} must be a {words[kind]}{of}, got {briefly(value)}")
 
 
 def _require_keys(where: str, content: Any, allowed: set[str], needed: set[str]) -> None:
     if not isinstance(content, dict):
-        raise ValueError(f"{where}: must be a mapping, got {type(content).__name__}")
+        raise ValueError(f"{where}: must be a mapping, got {briefly(content)}")
+    for key in content:
+        if not isinstance(key, str):
+            raise ValueError(f"{where}: keys must be text, got {briefly(key)}")
     for key in sorted(needed - set(content)):
         raise ValueError(f"{where}: must have {key}, got keys {sorted(content)}")
     for key in sorted(set(content) - allowed):

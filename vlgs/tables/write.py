@@ -17,7 +17,8 @@ from vlgs.tables.frame import (
 )
 from vlgs.tables.latex import document, to_latex
 from vlgs.tables.markdown import to_csv, to_markdown
-from vlgs.tables.registry import Table
+from vlgs.tables.registry import Table, is_label
+from vlgs.text import to_bytes
 
 
 def write_all(
@@ -85,9 +86,10 @@ def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
     """Each table as csv, Markdown and LaTeX, and one document over all tables of the folder."""
     for table in filled:
         stem = folder / table.table.label
-        write_changed(stem.with_suffix(".csv"), to_csv(table).encode())
-        write_changed(stem.with_suffix(".md"), to_markdown(table).encode())
-        write_changed(stem.with_suffix(".tex"), to_latex(table).encode())
-    labels = sorted(path.stem for path in folder.glob("*.tex") if path.stem != "tables")
+        write_changed(stem.with_suffix(".csv"), to_bytes(to_csv(table)))
+        write_changed(stem.with_suffix(".md"), to_bytes(to_markdown(table)))
+        write_changed(stem.with_suffix(".tex"), to_bytes(to_latex(table)))
+    stems = (path.stem for path in folder.glob("*.tex"))
+    labels = sorted(stem for stem in stems if stem != "tables" and is_label(stem))
     text = document(f"Ablations on {folder.name}", labels)
-    write_changed(folder / "tables.tex", text.encode())
+    write_changed(folder / "tables.tex", to_bytes(text))
