@@ -186,14 +186,15 @@ VLGS_INLINE Pack<T> project_values(const T *values, const T *upstream, int64_t c
 }
 
 // Gradients of kWidth channels (a multiple of 4, at most 16), summed over the blocks.
-template <class T, int kChains, int kWidth>
+template <class T, int kWidth>
 VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks, int64_t offset, T *slot) {
   Pack<T> acc[kLanes];
   for (auto &a : acc) a = splat(T(0));
+  const int64_t stride = state_size(tile.pass->chains);
   const T *weights = tile.state + (kChainState + chain * kChainStates + kAlphaT) * kLanes;
   for (; blocks; blocks &= blocks - 1) {
     const int64_t b = __builtin_ctz(blocks);
-    const Pack<T> weight = load(weights + b * state_size(kChains));
+    const Pack<T> weight = load(weights + b * stride);
     const T *upstream = tile.upstream + b * tile.upstream_stride + offset * kLanes;
     for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, load(upstream + k * kLanes), acc[k]);
   }
@@ -202,7 +203,30 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (int k = 0; k < kWidth; ++k) slot[k] = sums[k];
 }
 
-template <class T, int kChains, Need kNeed, bool kClamp>
+// Gradients of all channels but the first `lead`, from the weights that are kept of every block. A function
+// of its own: of what is compiled once for every kind of pass, this part is the same in all.
+template <class T>
+[[gnu::noinline]] void all_value_gradients(const Tile<T> &tile, uint32_t blocks, int64_t lead, T *slot) {
+  const Pass<T> &p = *tile.pass;
+  int64_t offset = 0;
+  for (int i = 0; i < p.num_parts; ++i) {
+    const Part<T> &part = p.parts[i];
+    T *to = slot + part.slot;
+    int64_t k = i == 0 ? lead : 0;
+    if (part.value_grad) {
+      for (; k + 16 <= part.padded; k += 16)
+        value_gradients<T, 16>(tile, part.chain, blocks, offset + k, to + k);
+      const int64_t left = part.padded - k;
+      if (left == 12) value_gradients<T, 12>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 8) value_gradients<T, 8>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 4) value_gradients<T, 4>(tile, part.chain, blocks, offset + k, to + k);
+    }
+    offset += part.padded;
+  }
+}
+
+// Among so many channels the clamp costs nothing: one copy for all.
+template <class T, int kChains, Need kNeed>
 inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   // The first channels are summed together with the moments, which leave that much room.
   constexpr int kLead = kNeed == Need::kValuesOnly ? 0 : 4;
@@ -227,7 +251,7 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
       }
     }
     T *state = tile.state + b * state_size(kChains);
-    step<T, kChains, kNeed, kClamp>(tile, g, state, toward, sums, weights);
+    step<T, kChains, kNeed, true>(tile, g, state, toward, sums, weights);
     for (int c = 0; c < kChains; ++c)
       store(state + (kChainState + c * kChainStates + kAlphaT) * kLanes, weights[c]);
     upstream = tile.upstream + b * tile.upstream_stride;
@@ -247,39 +271,22 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
   } else {
     for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
   }
-
-  int64_t offset = 0;
-  for (int i = 0; i < p.num_parts; ++i) {
-    const Part<T> &part = p.parts[i];
-    T *to = slot + part.slot;
-    int64_t k = i == 0 ? kLead : 0;
-    if (part.value_grad) {
-      for (; k + 16 <= part.padded; k += 16)
-        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
-      const int64_t left = part.padded - k;
-      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
-    }
-    offset += part.padded;
-  }
+  all_value_gradients(tile, blocks, kLead, slot);
 }
 
-template <class T, int kChains, Need kNeed, bool kClamp>
+// kParts: how many parts of three channels ride in the record; 0 where values are wide.
+template <class T, int kChains, int kParts, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
-  if (tile.pass->narrow && tile.pass->num_parts == kChains)
-    gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
-  else if (tile.pass->narrow)
-    gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
+  if constexpr (kParts > 0)
+    gaussian_narrow<T, kChains, kParts, kNeed, kClamp>(tile, g, blocks, slot);
   else
-    gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+    gaussian_wide<T, kChains, kNeed>(tile, g, blocks, slot);
 }
 
-template <class T, int kChains, Need kNeed>
-void blend_tile_backward(const Tile<T> &given, T *slots) {
+template <class T, int kChains, int kParts, Need kNeed>
+void walk_tile(const Tile<T> &given, Live live, T *slots) {
   const Tile<T> tile = given;  // a copy that no store can reach stays in registers
   const Pass<T> &p = *tile.pass;
-  Live live = live_blocks(tile);
   for (int64_t place = tile.count - 1; place >= 0; --place) {
     const uint32_t blocks = p.masks[tile.begin + place] & live.at(place);
     T *slot = slots + place * p.slot_size;
@@ -289,21 +296,33 @@ void blend_tile_backward(const Tile<T> &given, T *slots) {
     if (!blocks)
       for (int64_t i = 0; i < p.slot_size; ++i) slot[i] = 0;
     else if (clamps)
-      gaussian<T, kChains, kNeed, true>(tile, g, blocks, slot);
+      gaussian<T, kChains, kParts, kNeed, true>(tile, g, blocks, slot);
     else
-      gaussian<T, kChains, kNeed, false>(tile, g, blocks, slot);
+      gaussian<T, kChains, kParts, kNeed, false>(tile, g, blocks, slot);
   }
 }
 
-template <class T, int kChains>
-void blend_tile_backward(const Tile<T> &tile, T *slots) {
+template <class T, int kChains, int kParts>
+void walk_tile(const Tile<T> &tile, T *slots) {
   const Pass<T> &p = *tile.pass;
+  const Live live = live_blocks(tile);
   if (p.shape_grads)
-    blend_tile_backward<T, kChains, Need::kShape>(tile, slots);
+    walk_tile<T, kChains, kParts, Need::kShape>(tile, live, slots);
   else if (p.weight_grads)
-    blend_tile_backward<T, kChains, Need::kWeight>(tile, slots);
+    walk_tile<T, kChains, kParts, Need::kWeight>(tile, live, slots);
   else
-    blend_tile_backward<T, kChains, Need::kValuesOnly>(tile, slots);
+    walk_tile<T, kChains, kParts, Need::kValuesOnly>(tile, live, slots);
+}
+
+template <class T>
+void walk_tile(const Tile<T> &tile, T *slots) {
+  const Pass<T> &p = *tile.pass;
+  if (p.chains == 1)
+    !p.narrow          ? walk_tile<T, 1, 0>(tile, slots)
+    : p.num_parts == 1 ? walk_tile<T, 1, 1>(tile, slots)
+                       : walk_tile<T, 1, kNarrowParts>(tile, slots);
+  else
+    p.narrow ? walk_tile<T, 2, kNarrowParts>(tile, slots) : walk_tile<T, 2, 0>(tile, slots);
 }
 
 }  // namespace
@@ -340,13 +359,11 @@ bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
       store(chain + kBehind * kLanes, splat(T(0)));
     }
   }
-  p.chains == 1 ? blend_tile_backward<T, 1>(tile, slots) : blend_tile_backward<T, 2>(tile, slots);
+  walk_tile(tile, slots);
   return true;
 }
 
-template int64_t backward_scratch(const Pass<float> &, int64_t);
-template int64_t backward_scratch(const Pass<double> &, int64_t);
-template bool blend_backward(const Pass<float> &, int64_t, float *, float *);
-template bool blend_backward(const Pass<double> &, int64_t, double *, double *);
+template int64_t backward_scratch(const Pass<Number> &, int64_t);
+template bool blend_backward(const Pass<Number> &, int64_t, Number *, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

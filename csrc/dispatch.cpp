@@ -12,22 +12,23 @@
 // VLGS_BUILT is X(v4) X(v3) X(base), or what CMakeLists.txt was asked for of it.
 #define X(set)                            \
   namespace vlgs::isa_##set {             \
-    extern const Kernels<float> kFloat;   \
-    extern const Kernels<double> kDouble; \
+    extern const Kernels<float> kKernels; \
   }
 VLGS_BUILT
 #undef X
+namespace vlgs::isa_double {
+extern const Kernels<double> kKernels;  // for every machine and every choice
+}
 
 namespace vlgs {
 namespace {
 
 struct Choice {
   const char *name;
-  const Kernels<float> *single;
-  const Kernels<double> *full;
+  const Kernels<float> *kernels;
 };
 
-#define X(set) {#set, &isa_##set::kFloat, &isa_##set::kDouble},
+#define X(set) {#set, &isa_##set::kKernels},
 constexpr Choice kBuilt[] = {VLGS_BUILT};
 #undef X
 
@@ -68,13 +69,18 @@ const Choice &choice() {
 }  // namespace
 
 const char *isa() { return choice().name; }
+const char *built_isas() {
+#define X(set) #set " "
+  return VLGS_BUILT;
+#undef X
+}
 template <>
 const Kernels<float> &kernels<float>() {
-  return *choice().single;
+  return *choice().kernels;
 }
 template <>
 const Kernels<double> &kernels<double>() {
-  return *choice().full;
+  return isa_double::kKernels;
 }
 
 }  // namespace vlgs
