@@ -151,14 +151,14 @@ def run_kernel(
 
 
 def _children(isas: Sequence[str], stack: ExitStack) -> dict[str, Child]:
-    """A process for every instruction set that this CPU has; the kernel silently lowers what it cannot do."""
+    """A process for every instruction set that this CPU and this build have; the kernel silently lowers what it cannot do."""
     children: dict[str, Child] = {}
     for isa in isas:
         child = stack.enter_context(Child(isa))
         if child.isa == isa:
             children[isa] = child
         else:
-            say(f"{isa}: this CPU has {child.isa} at best; left out")
+            say(f"{isa}: this CPU and this build have {child.isa} at best; left out")
     return children
 
 

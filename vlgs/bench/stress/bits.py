@@ -81,7 +81,7 @@ def on(isa: str) -> Callable[[bool], Verdict]:
         digests = measure(full) if isa == _csrc.isa() else _in_process(isa, full)
         (found,) = digests.pop("isa")
         if found != isa:
-            raise CannotRunError(f"this machine has {found} at best")
+            raise CannotRunError(f"this machine and this build have {found} at best")
         parts = [f"{len(set(runs))} of {len(runs)} {what}" for what, runs in digests.items()]
         passed = all(len(set(runs)) == 1 for runs in digests.values())
         return Verdict(f"different results: {', '.join(parts)}", passed)
