@@ -186,15 +186,14 @@ VLGS_INLINE Pack<T> project_values(const T *values, const T *upstream, int64_t c
 }
 
 // Gradients of kWidth channels (a multiple of 4, at most 16), summed over the blocks.
-template <class T, int kWidth>
+template <class T, int kChains, int kWidth>
 VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks, int64_t offset, T *slot) {
   Pack<T> acc[kLanes];
   for (auto &a : acc) a = splat(T(0));
-  const int64_t stride = state_size(tile.pass->chains);
   const T *weights = tile.state + (kChainState + chain * kChainStates + kAlphaT) * kLanes;
   for (; blocks; blocks &= blocks - 1) {
     const int64_t b = __builtin_ctz(blocks);
-    const Pack<T> weight = load(weights + b * stride);
+    const Pack<T> weight = load(weights + b * state_size(kChains));
     const T *upstream = tile.upstream + b * tile.upstream_stride + offset * kLanes;
     for (int k = 0; k < kWidth; ++k) acc[k] = fma(weight, load(upstream + k * kLanes), acc[k]);
   }
@@ -203,10 +202,9 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (int k = 0; k < kWidth; ++k) slot[k] = sums[k];
 }
 
-// Gradients of all channels but the first `lead`, from the weights that are kept of every block. A function
-// of its own: of what is compiled once for every kind of pass, this part is the same in all.
-template <class T>
-[[gnu::noinline]] void all_value_gradients(const Tile<T> &tile, uint32_t blocks, int64_t lead, T *slot) {
+// Gradients of all channels but the first `lead`, from the weights that are kept of every block.
+template <class T, int kChains>
+VLGS_INLINE void all_value_gradients(const Tile<T> &tile, uint32_t blocks, int64_t lead, T *slot) {
   const Pass<T> &p = *tile.pass;
   int64_t offset = 0;
   for (int i = 0; i < p.num_parts; ++i) {
@@ -215,18 +213,17 @@ template <class T>
     int64_t k = i == 0 ? lead : 0;
     if (part.value_grad) {
       for (; k + 16 <= part.padded; k += 16)
-        value_gradients<T, 16>(tile, part.chain, blocks, offset + k, to + k);
+        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
       const int64_t left = part.padded - k;
-      if (left == 12) value_gradients<T, 12>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 8) value_gradients<T, 8>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 4) value_gradients<T, 4>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
     }
     offset += part.padded;
   }
 }
 
-// Among so many channels the clamp costs nothing: one copy for all.
-template <class T, int kChains, Need kNeed>
+template <class T, int kChains, Need kNeed, bool kClamp>
 inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   // The first channels are summed together with the moments, which leave that much room.
   constexpr int kLead = kNeed == Need::kValuesOnly ? 0 : 4;
@@ -251,7 +248,7 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
       }
     }
     T *state = tile.state + b * state_size(kChains);
-    step<T, kChains, kNeed, true>(tile, g, state, toward, sums, weights);
+    step<T, kChains, kNeed, kClamp>(tile, g, state, toward, sums, weights);
     for (int c = 0; c < kChains; ++c)
       store(state + (kChainState + c * kChainStates + kAlphaT) * kLanes, weights[c]);
     upstream = tile.upstream + b * tile.upstream_stride;
@@ -271,7 +268,7 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
   } else {
     for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
   }
-  all_value_gradients(tile, blocks, kLead, slot);
+  all_value_gradients<T, kChains>(tile, blocks, kLead, slot);
 }
 
 // kParts: how many parts of three channels ride in the record; 0 where values are wide.
@@ -280,7 +277,7 @@ VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
   if constexpr (kParts > 0)
     gaussian_narrow<T, kChains, kParts, kNeed, kClamp>(tile, g, blocks, slot);
   else
-    gaussian_wide<T, kChains, kNeed>(tile, g, blocks, slot);
+    gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
 }
 
 template <class T, int kChains, int kParts, Need kNeed>
