@@ -64,7 +64,9 @@ def test_every_instruction_set_draws_the_reference(isa: str):
     best = ["base", "v3", "v4"]
     assert done.stdout.strip() in best[: best.index(isa) + 1]
     if done.stdout.strip() != isa:
-        pytest.skip(f"{isa}: built are {_csrc.built_isas()}and {done.stdout.strip()} ran; VLGS_ISAS chooses")
+        pytest.skip(
+            f"{isa}: built are {_csrc.built_isas()}and {done.stdout.strip()} ran; VLGS_ISAS chooses"
+        )
 
 
 def test_what_is_built_is_known_and_what_runs_is_of_it():
