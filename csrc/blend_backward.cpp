@@ -202,27 +202,6 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (int k = 0; k < kWidth; ++k) slot[k] = sums[k];
 }
 
-// Gradients of all channels but the first `lead`, from the weights that are kept of every block.
-template <class T, int kChains>
-VLGS_INLINE void all_value_gradients(const Tile<T> &tile, uint32_t blocks, int64_t lead, T *slot) {
-  const Pass<T> &p = *tile.pass;
-  int64_t offset = 0;
-  for (int i = 0; i < p.num_parts; ++i) {
-    const Part<T> &part = p.parts[i];
-    T *to = slot + part.slot;
-    int64_t k = i == 0 ? lead : 0;
-    if (part.value_grad) {
-      for (; k + 16 <= part.padded; k += 16)
-        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
-      const int64_t left = part.padded - k;
-      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
-    }
-    offset += part.padded;
-  }
-}
-
 template <class T, int kChains, Need kNeed, bool kClamp>
 inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   // The first channels are summed together with the moments, which leave that much room.
@@ -268,22 +247,39 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
   } else {
     for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
   }
-  all_value_gradients<T, kChains>(tile, blocks, kLead, slot);
+
+  int64_t offset = 0;
+  for (int i = 0; i < p.num_parts; ++i) {
+    const Part<T> &part = p.parts[i];
+    T *to = slot + part.slot;
+    int64_t k = i == 0 ? kLead : 0;
+    if (part.value_grad) {
+      for (; k + 16 <= part.padded; k += 16)
+        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
+      const int64_t left = part.padded - k;
+      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
+    }
+    offset += part.padded;
+  }
 }
 
-// kParts: how many parts of three channels ride in the record; 0 where values are wide.
-template <class T, int kChains, int kParts, Need kNeed, bool kClamp>
+template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
-  if constexpr (kParts > 0)
-    gaussian_narrow<T, kChains, kParts, kNeed, kClamp>(tile, g, blocks, slot);
+  if (tile.pass->narrow && tile.pass->num_parts == kChains)
+    gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+  else if (tile.pass->narrow)
+    gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
   else
     gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
 }
 
-template <class T, int kChains, int kParts, Need kNeed>
-void walk_tile(const Tile<T> &given, Live live, T *slots) {
+template <class T, int kChains, Need kNeed>
+void blend_tile_backward(const Tile<T> &given, T *slots) {
   const Tile<T> tile = given;  // a copy that no store can reach stays in registers
   const Pass<T> &p = *tile.pass;
+  Live live = live_blocks(tile);
   for (int64_t place = tile.count - 1; place >= 0; --place) {
     const uint32_t blocks = p.masks[tile.begin + place] & live.at(place);
     T *slot = slots + place * p.slot_size;
@@ -293,33 +289,21 @@ void walk_tile(const Tile<T> &given, Live live, T *slots) {
     if (!blocks)
       for (int64_t i = 0; i < p.slot_size; ++i) slot[i] = 0;
     else if (clamps)
-      gaussian<T, kChains, kParts, kNeed, true>(tile, g, blocks, slot);
+      gaussian<T, kChains, kNeed, true>(tile, g, blocks, slot);
     else
-      gaussian<T, kChains, kParts, kNeed, false>(tile, g, blocks, slot);
+      gaussian<T, kChains, kNeed, false>(tile, g, blocks, slot);
   }
 }
 
-template <class T, int kChains, int kParts>
-void walk_tile(const Tile<T> &tile, T *slots) {
+template <class T, int kChains>
+void blend_tile_backward(const Tile<T> &tile, T *slots) {
   const Pass<T> &p = *tile.pass;
-  const Live live = live_blocks(tile);
   if (p.shape_grads)
-    walk_tile<T, kChains, kParts, Need::kShape>(tile, live, slots);
+    blend_tile_backward<T, kChains, Need::kShape>(tile, slots);
   else if (p.weight_grads)
-    walk_tile<T, kChains, kParts, Need::kWeight>(tile, live, slots);
+    blend_tile_backward<T, kChains, Need::kWeight>(tile, slots);
   else
-    walk_tile<T, kChains, kParts, Need::kValuesOnly>(tile, live, slots);
-}
-
-template <class T>
-void walk_tile(const Tile<T> &tile, T *slots) {
-  const Pass<T> &p = *tile.pass;
-  if (p.chains == 1)
-    !p.narrow          ? walk_tile<T, 1, 0>(tile, slots)
-    : p.num_parts == 1 ? walk_tile<T, 1, 1>(tile, slots)
-                       : walk_tile<T, 1, kNarrowParts>(tile, slots);
-  else
-    p.narrow ? walk_tile<T, 2, kNarrowParts>(tile, slots) : walk_tile<T, 2, 0>(tile, slots);
+    blend_tile_backward<T, kChains, Need::kValuesOnly>(tile, slots);
 }
 
 }  // namespace
@@ -356,7 +340,7 @@ bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
       store(chain + kBehind * kLanes, splat(T(0)));
     }
   }
-  walk_tile(tile, slots);
+  p.chains == 1 ? blend_tile_backward<T, 1>(tile, slots) : blend_tile_backward<T, 2>(tile, slots);
   return true;
 }
 

@@ -191,16 +191,17 @@ inline int64_t list_block(const uint16_t *masks, int64_t count, int b, uint32_t 
   return reach;
 }
 
-// kParts: how many parts of three channels ride in the record; 0 where values are wide.
-template <class T, int kChains, int kParts, bool kBefore>
+template <class T, int kChains, bool kBefore>
 void blend_tile(const Tile<T> &tile) {
   const Pass<T> &p = *tile.pass;
   for (int b = 0; b < kBlocks; ++b) {
     const int64_t reach = list_block(p.masks + tile.begin, tile.count, b, tile.list);
     const Centres<T> at = centres<T>(p.grid, tile.index, b);
     Rays<T, kChains> rays = start_rays<T, kChains>(p, at);
-    if constexpr (kParts > 0)
-      sum_narrow<T, kChains, kParts, kBefore>(tile, at, reach, rays);
+    if (p.narrow && p.num_parts == kChains)
+      sum_narrow<T, kChains, kChains, kBefore>(tile, at, reach, rays);
+    else if (p.narrow)
+      sum_narrow<T, kChains, kNarrowParts, kBefore>(tile, at, reach, rays);
     else
       sum_wide<T, kChains, kBefore>(tile, at, reach, rays);
 
@@ -218,17 +219,6 @@ void blend_tile(const Tile<T> &tile) {
   }
 }
 
-template <class T, bool kBefore>
-void blend_tile(const Tile<T> &tile) {
-  const Pass<T> &p = *tile.pass;
-  if (p.chains == 1)
-    !p.narrow          ? blend_tile<T, 1, 0, kBefore>(tile)
-    : p.num_parts == 1 ? blend_tile<T, 1, 1, kBefore>(tile)
-                       : blend_tile<T, 1, kNarrowParts, kBefore>(tile);
-  else
-    p.narrow ? blend_tile<T, 2, kNarrowParts, kBefore>(tile) : blend_tile<T, 2, 0, kBefore>(tile);
-}
-
 }  // namespace
 
 template <class T>
@@ -244,7 +234,10 @@ void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
   gather_records(p, begin, begin + count, records);
   T *weights = carver.take(kMaxChains * kWeightsAhead * kLanes);
   const Tile<T> tile{&p, index, begin, count, records, list, weights, carver.take(p.channels * kLanes)};
-  p.stop_before ? blend_tile<T, true>(tile) : blend_tile<T, false>(tile);
+  if (p.chains == 1)
+    p.stop_before ? blend_tile<T, 1, true>(tile) : blend_tile<T, 1, false>(tile);
+  else
+    p.stop_before ? blend_tile<T, 2, true>(tile) : blend_tile<T, 2, false>(tile);
 }
 
 template int64_t blend_scratch(const Pass<Number> &, int64_t);

@@ -58,7 +58,7 @@ Choice choose() {
   }
   throw std::invalid_argument(
       "VLGS_ISA: must allow an instruction set of this machine that this build has (" + names + "), got " +
-      limit);
+      limit + "; install again on this machine, or for many with VLGS_ISAS='v4;v3;base' in the environment");
 }
 
 const Choice &choice() {
@@ -69,10 +69,14 @@ const Choice &choice() {
 }  // namespace
 
 const char *isa() { return choice().name; }
-const char *built_isas() {
-#define X(set) #set " "
-  return VLGS_BUILT;
-#undef X
+const char *isas() {
+  static const std::string made = [] {
+    std::string names;
+    for (const Choice &built : kBuilt)
+      if (runs_here(built.name)) names += std::string(names.empty() ? "" : " ") + built.name;
+    return names;
+  }();
+  return made.c_str();
 }
 template <>
 const Kernels<float> &kernels<float>() {

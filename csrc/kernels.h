@@ -208,7 +208,8 @@ struct Kernels {
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.
 const char *isa();
-const char *built_isas();  // what this build has, best first, a blank behind each
+// Those of this build that run here, best first, with blanks between.
+const char *isas();
 template <class T>
 const Kernels<T> &kernels();
 
