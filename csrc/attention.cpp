@@ -332,13 +332,9 @@ void attention_backward(const Attention<T> &a, Fused<const T *> d_out, Fused<T *
   }
 }
 
-template int64_t attention_scratch<float>(const AttentionShape &);
-template int64_t attention_scratch<double>(const AttentionShape &);
-template void attention(const Attention<float> &, Fused<float *>, int64_t, int64_t, float *);
-template void attention(const Attention<double> &, Fused<double *>, int64_t, int64_t, double *);
-template void attention_backward(const Attention<float> &, Fused<const float *>, Fused<float *>, int64_t,
-                                 int64_t, float *, AttentionLayers<float *>);
-template void attention_backward(const Attention<double> &, Fused<const double *>, Fused<double *>, int64_t,
-                                 int64_t, double *, AttentionLayers<double *>);
+template int64_t attention_scratch<Number>(const AttentionShape &);
+template void attention(const Attention<Number> &, Fused<Number *>, int64_t, int64_t, Number *);
+template void attention_backward(const Attention<Number> &, Fused<const Number *>, Fused<Number *>, int64_t,
+                                 int64_t, Number *, AttentionLayers<Number *>);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -355,6 +355,7 @@ NB_MODULE(_csrc, m) {
   nb::set_leak_warnings(false);
   isa();  // a wish that cannot be met ends the import; later it would be thrown inside a parallel loop
   m.def("isa", &isa);
+  m.def("isas", &isas);
   m.def("multiply_adds", &multiply_adds, "packs"_a);
   nb::class_<Camera>(m, "Camera")
       .def(

@@ -344,9 +344,7 @@ bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
   return true;
 }
 
-template int64_t backward_scratch(const Pass<float> &, int64_t);
-template int64_t backward_scratch(const Pass<double> &, int64_t);
-template bool blend_backward(const Pass<float> &, int64_t, float *, float *);
-template bool blend_backward(const Pass<double> &, int64_t, double *, double *);
+template int64_t backward_scratch(const Pass<Number> &, int64_t);
+template bool blend_backward(const Pass<Number> &, int64_t, Number *, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

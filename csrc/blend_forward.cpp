@@ -240,9 +240,7 @@ void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
     p.stop_before ? blend_tile<T, 2, true>(tile) : blend_tile<T, 2, false>(tile);
 }
 
-template int64_t blend_scratch(const Pass<float> &, int64_t);
-template int64_t blend_scratch(const Pass<double> &, int64_t);
-template void blend(const Pass<float> &, int64_t, float *, uint32_t *);
-template void blend(const Pass<double> &, int64_t, double *, uint32_t *);
+template int64_t blend_scratch(const Pass<Number> &, int64_t);
+template void blend(const Pass<Number> &, int64_t, Number *, uint32_t *);
 
 }  // namespace vlgs::VLGS_ISA_NS

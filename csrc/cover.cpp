@@ -132,9 +132,7 @@ void cover(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
   }
 }
 
-template void boxes(Grid, int64_t, const float *, const float *, float, const float *, Box *);
-template void boxes(Grid, int64_t, const double *, const double *, double, const double *, Box *);
-template void cover(Grid, const float *, float, Box, uint16_t *);
-template void cover(Grid, const double *, double, Box, uint16_t *);
+template void boxes(Grid, int64_t, const Number *, const Number *, Number, const Number *, Box *);
+template void cover(Grid, const Number *, Number, Box, uint16_t *);
 
 }  // namespace vlgs::VLGS_ISA_NS

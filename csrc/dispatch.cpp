@@ -12,22 +12,23 @@
 // VLGS_BUILT is X(v4) X(v3) X(base), or what CMakeLists.txt was asked for of it.
 #define X(set)                            \
   namespace vlgs::isa_##set {             \
-    extern const Kernels<float> kFloat;   \
-    extern const Kernels<double> kDouble; \
+    extern const Kernels<float> kKernels; \
   }
 VLGS_BUILT
 #undef X
+namespace vlgs::isa_double {
+extern const Kernels<double> kKernels;  // for every machine and every choice
+}
 
 namespace vlgs {
 namespace {
 
 struct Choice {
   const char *name;
-  const Kernels<float> *single;
-  const Kernels<double> *full;
+  const Kernels<float> *kernels;
 };
 
-#define X(set) {#set, &isa_##set::kFloat, &isa_##set::kDouble},
+#define X(set) {#set, &isa_##set::kKernels},
 constexpr Choice kBuilt[] = {VLGS_BUILT};
 #undef X
 
@@ -57,7 +58,7 @@ Choice choose() {
   }
   throw std::invalid_argument(
       "VLGS_ISA: must allow an instruction set of this machine that this build has (" + names + "), got " +
-      limit);
+      limit + "; install again on this machine, or for many with VLGS_ISAS='v4;v3;base' in the environment");
 }
 
 const Choice &choice() {
@@ -68,13 +69,22 @@ const Choice &choice() {
 }  // namespace
 
 const char *isa() { return choice().name; }
+const char *isas() {
+  static const std::string made = [] {
+    std::string names;
+    for (const Choice &built : kBuilt)
+      if (runs_here(built.name)) names += std::string(names.empty() ? "" : " ") + built.name;
+    return names;
+  }();
+  return made.c_str();
+}
 template <>
 const Kernels<float> &kernels<float>() {
-  return *choice().single;
+  return *choice().kernels;
 }
 template <>
 const Kernels<double> &kernels<double>() {
-  return *choice().full;
+  return isa_double::kKernels;
 }
 
 }  // namespace vlgs

@@ -117,14 +117,11 @@ void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blo
     gather_channels<T, 1>(count, entries, blocks, weights, upstream + k * kLanes, channels, d_value + k);
 }
 
-#define VLGS_FROZEN(T)                                                                                      \
-  template void freeze(const Pass<T> &, int64_t, int64_t *, uint32_t *, T *);                               \
-  template void frozen_blend(const Grid &, int64_t, int64_t, const uint32_t *, const T *, const T *,        \
-                             int64_t, T *, T *);                                                            \
-  template void frozen_upstream(const Grid &, int64_t, const T *, int64_t, T *);                            \
-  template void frozen_backward(int64_t, const uint32_t *, const uint32_t *, const T *, const T *, int64_t, \
-                                T *);
-VLGS_FROZEN(float)
-VLGS_FROZEN(double)
+template void freeze(const Pass<Number> &, int64_t, int64_t *, uint32_t *, Number *);
+template void frozen_blend(const Grid &, int64_t, int64_t, const uint32_t *, const Number *, const Number *,
+                           int64_t, Number *, Number *);
+template void frozen_upstream(const Grid &, int64_t, const Number *, int64_t, Number *);
+template void frozen_backward(int64_t, const uint32_t *, const uint32_t *, const Number *, const Number *,
+                              int64_t, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -3,11 +3,13 @@
 
 #include "kernels.h"
 
-#if !defined(VLGS_ISA_NS)
-#error "compile the kernels with -DVLGS_ISA_NS=<name>"
+#if !defined(VLGS_ISA_NS) || !defined(VLGS_NUMBER)
+#error "compile the kernels with -DVLGS_ISA_NS=<name> -DVLGS_NUMBER=<float or double>"
 #endif
 
 namespace vlgs::VLGS_ISA_NS {
+
+using Number = VLGS_NUMBER;
 
 template <class T>
 void project(const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end);
@@ -56,7 +58,6 @@ template <class T>
 void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
                      const T *upstream, int64_t channels, T *d_value);
 
-extern const Kernels<float> kFloat;
-extern const Kernels<double> kDouble;
+extern const Kernels<Number> kKernels;
 
 }  // namespace vlgs::VLGS_ISA_NS

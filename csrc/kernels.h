@@ -1,6 +1,6 @@
 // What the kernels work on, and the list of them. They know arrays and nothing else: no Python, no threads,
-// no allocation. Every kernel is compiled once per instruction set, into that set's namespace, and chosen at
-// run time (dispatch.cpp).
+// no allocation. Every kernel is compiled once per instruction set for float, into that set's namespace, and
+// chosen at run time (dispatch.cpp); for double once, for any machine.
 //
 // Matrices are row by row. n Gaussians in the caller's order; m visible ones in the order of (depth, row),
 // "ranks".
@@ -208,6 +208,8 @@ struct Kernels {
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.
 const char *isa();
+// Those of this build that run here, best first, with blanks between.
+const char *isas();
 template <class T>
 const Kernels<T> &kernels();
 

@@ -209,9 +209,7 @@ void project_backward(const Camera &c, Gaussians<T> g, GaussianGrads<T> d, int64
   }
 }
 
-template void project(const Camera &, Gaussians<float>, Splats<float>, int64_t, int64_t);
-template void project(const Camera &, Gaussians<double>, Splats<double>, int64_t, int64_t);
-template void project_backward(const Camera &, Gaussians<float>, GaussianGrads<float>, int64_t, int64_t);
-template void project_backward(const Camera &, Gaussians<double>, GaussianGrads<double>, int64_t, int64_t);
+template void project(const Camera &, Gaussians<Number>, Splats<Number>, int64_t, int64_t);
+template void project_backward(const Camera &, Gaussians<Number>, GaussianGrads<Number>, int64_t, int64_t);
 
 }  // namespace vlgs::VLGS_ISA_NS

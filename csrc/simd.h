@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <cstring>
 
-#if defined(__x86_64__)
+#if defined(__AVX2__)  // elsewhere nothing of it is used, and reading it takes a quarter of a second per file
 #include <immintrin.h>
 #endif
 
@@ -13,9 +13,9 @@ namespace vlgs::VLGS_ISA_NS {
 
 constexpr int kLanes = 16;
 
-// Packs that travel through a call travel through memory. Sanitizers look on there: what they add to code
-// that is inlined everywhere takes the compiler minutes.
-#if defined(__SANITIZE_ADDRESS__)
+// Packs that travel through a call travel through memory, which is slow to run and quick to compile.
+// Sanitizers look on there: what they add to code that is inlined everywhere takes the compiler minutes.
+#if defined(__SANITIZE_ADDRESS__) || defined(VLGS_CALLS)
 #define VLGS_INLINE inline
 #else
 #define VLGS_INLINE inline __attribute__((always_inline))

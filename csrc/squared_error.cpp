@@ -57,9 +57,7 @@ void squared_error_chunk_backward(const SquaredError<T> &e, T scale, T *d_a, int
   });
 }
 
-template ErrorSum squared_error_chunk(const SquaredError<float> &, int64_t, int64_t);
-template ErrorSum squared_error_chunk(const SquaredError<double> &, int64_t, int64_t);
-template void squared_error_chunk_backward(const SquaredError<float> &, float, float *, int64_t, int64_t);
-template void squared_error_chunk_backward(const SquaredError<double> &, double, double *, int64_t, int64_t);
+template ErrorSum squared_error_chunk(const SquaredError<Number> &, int64_t, int64_t);
+template void squared_error_chunk_backward(const SquaredError<Number> &, Number, Number *, int64_t, int64_t);
 
 }  // namespace vlgs::VLGS_ISA_NS

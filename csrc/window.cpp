@@ -113,9 +113,7 @@ void similarity_plane(const Similarity<T> &s, int64_t channel, T *scratch) {
   }
 }
 
-template void filter_plane(const Window<float> &, int64_t, float *);
-template void filter_plane(const Window<double> &, int64_t, double *);
-template void similarity_plane(const Similarity<float> &, int64_t, float *);
-template void similarity_plane(const Similarity<double> &, int64_t, double *);
+template void filter_plane(const Window<Number> &, int64_t, Number *);
+template void similarity_plane(const Similarity<Number> &, int64_t, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -19,7 +19,6 @@ T multiply_add(int64_t rounds, T factor, T addend) {
   return total[0];
 }
 
-template float multiply_add(int64_t, float, float);
-template double multiply_add(int64_t, double, double);
+template Number multiply_add(int64_t, Number, Number);
 
 }  // namespace vlgs::VLGS_ISA_NS

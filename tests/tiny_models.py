@@ -3,12 +3,14 @@
 import json
 from pathlib import Path
 
+import pytest
 import torch
 
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 
 
 def save_sam(folder: Path) -> None:
+    pytest.importorskip("transformers")
     from transformers import SamConfig, SamModel
 
     config = SamConfig(
@@ -36,6 +38,7 @@ def save_sam(folder: Path) -> None:
 
 
 def save_clip(folder: Path) -> None:
+    pytest.importorskip("transformers")
     from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
 
     letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
@@ -58,6 +61,7 @@ def save_clip(folder: Path) -> None:
 
 def save_siglip(folder: Path, flexible: bool = False) -> None:
     """SigLIP 2: of one image size, which transformers calls siglip, or its flexible kind, siglip2."""
+    pytest.importorskip("transformers")
     from transformers import (
         Siglip2Config,
         Siglip2Model,

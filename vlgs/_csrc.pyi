@@ -7,6 +7,9 @@ from torch import Tensor
 def isa() -> str:
     """The instruction set in use: ``v4`` (AVX-512), ``v3`` (AVX2) or ``base``; lowered by the environment's VLGS_ISA."""
 
+def isas() -> str:
+    """The instruction sets that were compiled and run on this machine, best first, separated by blanks."""
+
 def multiply_adds(packs: int) -> int: ...
 
 class Camera:

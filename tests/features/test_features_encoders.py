@@ -35,6 +35,7 @@ def test_averaging_lowers_the_noise_of_a_crop_that_shrinks():
 
 
 def test_vectors_are_clips_own(weights: Path):
+    pytest.importorskip("transformers")
     from transformers import CLIPModel
 
     image, mask = noise(), Mask(3, 2, np.ones((16, 16), bool))
@@ -55,6 +56,7 @@ def test_vectors_are_clips_own(weights: Path):
 def test_other_towers_of_transformers_encode_too(tmp_path: Path, kind: str):
     import json
 
+    pytest.importorskip("transformers")
     from transformers import Dinov2Config, Dinov2Model, SiglipConfig, SiglipModel
 
     small = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}

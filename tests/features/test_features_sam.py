@@ -29,6 +29,7 @@ def segmenter(weights: Path, prompts: GridPrompts = PROMPTS, **options) -> SamSe
 @pytest.mark.parametrize("size", [(45, 70), (1080, 607), (64, 64)])
 @pytest.mark.parametrize("layers", [0, 1, 2])
 def test_windows_are_those_of_transformers(size: tuple[int, int], layers: int):
+    pytest.importorskip("transformers")
     from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
 
     image = np.zeros((*size, 3), np.uint8)
@@ -46,6 +47,7 @@ def test_points_are_middles_of_a_grid():
 
 def test_candidates_are_those_of_transformers(weights: Path):
     """Same pixels, same logits, same thresholds, same border rule; masks and boxes agree to the pixel."""
+    pytest.importorskip("transformers")
     from transformers import SamModel
     from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
 

@@ -86,6 +86,7 @@ def test_clip_gives_projected_unit_vectors(clip_folder: Path):
 
 
 def test_clip_agrees_with_the_towers_own_parts(clip_folder: Path):
+    pytest.importorskip("transformers")
     from transformers import CLIPModel, CLIPTokenizer
 
     clip = CLIPModel.from_pretrained(clip_folder).eval()
@@ -103,6 +104,7 @@ def test_clip_of_another_width_than_the_scene_is_refused(clip_folder: Path):
 
 @pytest.mark.parametrize("flexible", [False, True])
 def test_siglip_pools_the_last_of_a_full_row_of_lower_case(tmp_path: Path, flexible: bool):
+    pytest.importorskip("transformers")
     from transformers import AutoModel, AutoTokenizer
 
     save_siglip(tmp_path, flexible)
@@ -120,6 +122,7 @@ def test_siglip_pools_the_last_of_a_full_row_of_lower_case(tmp_path: Path, flexi
 
 
 def test_a_model_without_words_is_refused(tmp_path: Path):
+    pytest.importorskip("transformers")
     from transformers import Dinov2Config, Dinov2Model
 
     save_clip(tmp_path)  # its tokenizer stays

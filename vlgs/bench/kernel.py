@@ -151,14 +151,13 @@ def run_kernel(
 
 
 def _children(isas: Sequence[str], stack: ExitStack) -> dict[str, Child]:
-    """A process for every instruction set that this CPU has; the kernel silently lowers what it cannot do."""
+    """A process for every instruction set that this CPU and this build have."""
     children: dict[str, Child] = {}
     for isa in isas:
-        child = stack.enter_context(Child(isa))
-        if child.isa == isa:
-            children[isa] = child
+        if isa in _csrc.isas().split():
+            children[isa] = stack.enter_context(Child(isa))
         else:
-            say(f"{isa}: this CPU has {child.isa} at best; left out")
+            say(f"{isa}: this CPU and this build have {_csrc.isas()}; left out")
     return children
 
 
