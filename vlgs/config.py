@@ -3,6 +3,7 @@
 import hashlib
 import importlib.resources
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,6 +155,56 @@ def split_override(override: str) -> tuple[str, str]:
     """Key and value of a command-line argument; the value is empty where there is no ``=``."""
     key, _, value = override.partition("=")
     return key, value
+
+
+_NOT_TEXT = ("true", "false", "null", "nan", "inf")
+"""Words that Hydra reads as something else, in any case of letters."""
+
+
+def quote_override(key: str, value: str) -> str:
+    r"""An argument for Hydra that sets `key` to just this text, whatever is in it: blanks, umlauts, brackets, commas, quotes, ``${``.
+
+    A plain word is left bare, so that commands stay as people type them.
+
+    Example:
+        >>> quote_override("data.root", "scenes/kitchen"), quote_override("data.root", "my scenes/[1], Ö")
+        ('data.root=scenes/kitchen', "data.root='my scenes/[1], Ö'")
+    """
+    if re.fullmatch(r"[A-Za-z_./][\w./-]*", value, re.ASCII) and value.lower() not in _NOT_TEXT:
+        return f"{key}={value}"
+    # Within quotes Hydra takes a backslash as one, except before a quote; OmegaConf, which reads the text then, before ${.
+    text = re.sub(r"(\\*)\$\{", lambda match: match[1] * 2 + r"\${", value)
+    text = re.sub(r"(\\*)('|\Z)", lambda match: match[1] * 2 + (r"\'" if match[2] else ""), text)
+    return f"{key}='{text}'"
+
+
+def literal_override(argument: str) -> str:
+    """A command-line argument as given where Hydra reads one value in it, else with its value taken as text.
+
+    For commands that know no sweeps: ``data.root=/x/a, b`` is a folder, not two values.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    key, value = split_override(argument)
+    try:
+        read = OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return quote_override(key, value)
+    blank = isinstance(read.value(), str) and value != value.strip()
+    return quote_override(key, value) if read.is_sweep_override() or blank else argument
+
+
+def override_value(argument: str) -> Any:
+    """The value that Hydra reads in an argument, without its quotes.
+
+    Example:
+        >>> override_value("data.root='my scenes'")
+        'my scenes'
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return OverridesParser.create().parse_override(argument).value()
 
 
 @dataclass(frozen=True)

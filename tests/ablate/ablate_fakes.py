@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vlgs.ablate import job
-from vlgs.config import CONF, identity, run_id
+from vlgs.config import CONF, identity, override_value, run_id
 from vlgs.runs import BUSY, STOPPED, RunFolder
 
 TABLE = """
@@ -77,7 +77,7 @@ def leave(results: Path, metrics: dict[str, Any]) -> RunFolder:
 
 
 def _main(overrides: list[str]) -> int:
-    given = dict(word.split("=", 1) for word in overrides)
+    given = {word.partition("=")[0]: override_value(word) for word in overrides}
     results = Path(given["results"])
     key = f"{given.get('fusion', 'self')} {given['data.scene']} {given['seed']}"
     with (results / "ran.txt").open("a") as file:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -17,6 +18,7 @@ from vlgs.ablate.__main__ import Request, ablate, read
 from vlgs.ablate.job import Outcome, read_outcome, run_and_record
 from vlgs.ablate.plan import plan
 from vlgs.ablate.progress import Count, count
+from vlgs.config import override_value
 from vlgs.runs import STOPPED, UNSCORED
 from vlgs.tables.benchmark import Benchmark
 from vlgs.tables.registry import Table, load_table
@@ -301,3 +303,25 @@ def test_a_launcher_that_starts_nothing_is_an_error(
     monkeypatch.setattr(job, "run_and_record", broken)
     with pytest.raises(ValueError, match="launcher must start jobs, got OSError: no space left"):
         ablate(request_of(table, tmp_path / "r"))
+
+
+@pytest.mark.parametrize("name", ["Ünï dir", "a,b=[c] (d)", "it's"])
+def test_a_folder_may_have_any_name(table: Table, tmp_path: Path, name: str):
+    results = tmp_path / name
+    assert ablate(request_of(table, results)) == 0
+    assert len(list(results.glob("runs/*/metrics.json"))) == 2
+    assert (results / "synthetic" / "tiny.md").is_file()
+
+
+def test_the_command_line_takes_a_folder_of_any_name_and_prints_it_quoted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    root = str(tmp_path / "Ünï, [dir] (1)")
+    arguments = ["data=colmap", f"data.root={root}", f"results={root}", "tab=prune-on", "dry=true"]
+    monkeypatch.setattr(sys, "argv", ["ablate", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        runner.main()
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out.splitlines()[1]
+    words = shlex.split(printed)
+    assert override_value(words[words.index("data=colmap") + 1]) == root

@@ -13,6 +13,7 @@ and its log are shown), 130 stopped by Ctrl-C.
 """
 
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -23,7 +24,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
+from hydra.errors import HydraException
 from rich.console import Console
 from rich.markup import escape
 
@@ -31,7 +34,7 @@ from vlgs.ablate.job import STOP, Outcome
 from vlgs.ablate.launch import launch
 from vlgs.ablate.plan import PlannedRun, find, plan
 from vlgs.ablate.progress import Count, duration, shown
-from vlgs.config import split_override
+from vlgs.config import literal_override, override_value
 from vlgs.runs import STOPPED
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.frame import read_metrics
@@ -95,15 +98,15 @@ def read(arguments: Sequence[str]) -> Request:
         if key in OWN_KEYS:
             own[key] = value
         elif key.lstrip("+").startswith("hydra"):
-            launcher.append(argument)
+            launcher.append(literal_override(argument))
         else:
-            overrides.append(argument)
+            overrides.append(literal_override(argument))
     if "tab" not in own:
         raise ValueError("ablate: tab must be given, as tab=ab-multi or tab=all")
     dry = own.get("dry", "false").lower()
     if dry not in ("true", "false"):
         raise ValueError(f"ablate: dry must be true or false, got {dry}")
-    given = dict(map(split_override, overrides))
+    given = {key: str(value) for key, value in map(_split, overrides)}
     if "seed" in given:
         raise ValueError(f"ablate: seeds must be given as seeds=, got seed={given['seed']}")
     launcher += [o for o in overrides if o.startswith("threads=")]  # cores to ask a cluster for
@@ -155,7 +158,7 @@ def ablate(request: Request) -> int:
         missing, _ = _missing(planned, results, {})
         console.print(f"{len(planned)} runs, {len(missing)} to do")
         for run in missing:
-            console.print(f"  python -m vlgs.run {' '.join(run.overrides)}", markup=False)
+            console.print(f"  python -m vlgs.run {shlex.join(run.overrides)}", markup=False)
         return 0
     benchmark.extend(results / benchmark.name / "benchmark.yaml")
     composer.save()
@@ -256,6 +259,21 @@ def stop_file(path: Path) -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _split(override: str) -> tuple[str, Any]:
+    """Key and value of an argument that Hydra reads.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    try:
+        return override.partition("=")[0], override_value(override)
+    except HydraException as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise ValueError(
+            f"ablate: arguments must be KEY=VALUE, got {override}: {reason}"
+        ) from error
 
 
 def _scenes(dataset: str, given: Mapping[str, str]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 
 from vlgs.ablate.job import Outcome, read_outcome, run_job
-from vlgs.config import CONF
+from vlgs.config import CONF, quote_override
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +42,8 @@ def launch(
         ValueError: If the launcher does not exist, is not installed, or could not start a single job.
     """
     # Literal absolute folders: workers resolve what they are given again, in a folder and an environment of their own.
-    place = f"results={results.resolve()}"
-    own = [f"hydra.sweep.dir={folder.resolve()}", "hydra.sweep.subdir=."]
+    place = quote_override("results", str(results.resolve()))
+    own = [quote_override("hydra.sweep.dir", str(folder.resolve())), "hydra.sweep.subdir=."]
     quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
     jobs = [[*command, place] for command in commands]
     trouble: Exception | None = None

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vlgs.config import Identity
+from vlgs.config import Identity, quote_override
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import Table
 
@@ -52,7 +52,7 @@ def plan(
                 except ValueError as error:
                     raise ValueError(f"{title}: {error}") from error
                 for scene in benchmark.scenes:
-                    chosen = (f"data.scene={scene}",) if by_scene else ()
+                    chosen = (quote_override("data.scene", scene),) if by_scene else ()
                     command = (*benchmark.overrides, *row.overrides, *chosen, f"seed={seed}")
                     rows = wanted.setdefault((key, scene), (command, []))[1]
                     if title not in rows:

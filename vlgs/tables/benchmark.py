@@ -46,7 +46,11 @@ class Benchmark:
                 raise ValueError(
                     f"ablate: {name} must be given, each once, got {', '.join(map(str, values)) or 'none'}"
                 )
-        if not self.name or Path(self.name).name != self.name:
+        if (
+            Path(self.name).name != self.name
+            or self.name in ("", "..")
+            or not self.name.isprintable()
+        ):
             raise ValueError(f"ablate: name must be a folder's name, got {self.name!r}")
 
     @property
