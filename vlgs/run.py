@@ -4,7 +4,7 @@ import logging
 import os
 import resource
 import sys
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -115,18 +115,24 @@ def _text_encoder(config: DictConfig, scene: Any) -> Any:
 
     A word that it does not know is an error now, not after training.
     """
-    from vlgs.query import encode_prompts
+    from vlgs.query import encode_questions, words_of
     from vlgs.query.text import VocabularyText
 
-    if not scene.classes or scene.mask_vectors.shape[0] == 0:
+    if scene.mask_vectors.shape[0] == 0:
         return None
-    text = instantiate(config.text)(vocabulary=scene.vocabulary)
+    text, query = instantiate(config.text)(vocabulary=scene.vocabulary), instantiate(config.query)
+    if not words_of(scene, query):
+        log.warning(
+            "neither labels nor a vocabulary: language is trained but nothing can be asked (data.vocabulary=FILE, which "
+            "`python -m vlgs.vocabulary words.txt FILE` makes)"
+        )
+        return None
     if isinstance(text, VocabularyText) and scene.vocabulary is None:
         log.warning(
             "no vocabulary: language is trained but not scored (data.vocabulary=FILE or text=clip)"
         )
         return None
-    encode_prompts(instantiate(config.query), text, scene.classes)
+    encode_questions(query, text, scene)
     return text
 
 
@@ -164,11 +170,12 @@ def _report(
     """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
     from vlgs.gaussians import write_ply
     from vlgs.module.stages import all_skips
-    from vlgs.report.evaluate import evaluate, prompts_of
+    from vlgs.report.evaluate import evaluate
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
     from vlgs.report.results import write_metrics, write_queries
     from vlgs.report.timing import measure_fps
+    from vlgs.report.words import questions_of
 
     model, scene = models[-1], next(reversed(scenes.values()))
     query, protocol = instantiate(config.query), instantiate(config.protocol)
@@ -176,7 +183,11 @@ def _report(
     for stage in kept:
         write_ply(stage.folder.ply, stage.model.splats)
     evaluation = evaluate(models, scene, query, text, protocol)
-    prompts, _ = prompts_of(scene, query, text)
+    asked = questions_of(model, scene, query, text)
+    prompts = asked.prompts if asked else None
+    if asked and asked.note:
+        query = asked.query
+        evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
     timing = measure_fps(model, [view.camera for view in scene.test or scene.train], query, prompts)
     if config.pictures:
         write_pictures(folder.renders, model, scene, query, prompts)
