@@ -11,6 +11,7 @@ from omegaconf.errors import MissingMandatoryValue
 from rich.console import Console
 from torch import Tensor
 
+from vlgs.arguments import quote_places
 from vlgs.config import CONF, LEVELS, check_targets, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
@@ -150,7 +151,7 @@ def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
 
 def print_report(report: Report) -> None:
     """Summary, then errors, then warnings, then the verdict."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)
     for line in report.summary:
         console.print(line)
     wrong = errors(report.faults)
@@ -186,4 +187,5 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]
 if __name__ == "__main__":
     if {"--help", "-h"} & set(sys.argv):
         sys.argv.append("hydra/help=check")
+    sys.argv[1:] = quote_places(sys.argv[1:])
     main()

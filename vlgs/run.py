@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from vlgs.arguments import command_line, quote_places
 from vlgs.config import (
     CONF,
     GIVEN_FILES,
@@ -91,7 +92,7 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
     from vlgs.module.stages import StoppedError, train_all
 
     text = _text_encoder(config, next(reversed(scenes.values())))
-    folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
+    folder.config.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
     stages = _stages(folder, config, scenes)
     try:
         sharing, augment = instantiate(config.sharing), instantiate(config.augment)
@@ -237,8 +238,9 @@ def _dataset(config: DictConfig) -> str:
 
 def _command() -> str:
     overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    return " ".join(["python -m vlgs.run", *overrides])
+    return command_line("vlgs.run", overrides)
 
 
 if __name__ == "__main__":
+    sys.argv[1:] = quote_places(sys.argv[1:])
     main()
