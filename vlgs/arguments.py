@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import sys
 from collections.abc import Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -28,12 +29,23 @@ def quote_places(arguments: Sequence[str]) -> list[str]:
     A leading ``~/`` is the home folder, which a shell does not expand there. What is quoted already, ``null`` and ``${...}`` keep
     their meaning, and with ``-m`` so do commas: they separate the values of a sweep.
 
+    Raises:
+        ValueError: If a name is not UTF-8, or has the beginning of an interpolation and not its end: no configuration carries it.
+
     Example:
         >>> quote_places(["data=colmap", "data.root=/x/Ü (1), [b]=c"])
         ['data=colmap', "data.root='/x/Ü (1), [b]=c'"]
     """
     several = bool({"-m", "--multirun"} & set(arguments))
     return [_quoted(argument, several) for argument in arguments]
+
+
+def take_command_line() -> None:
+    """Quote the places on the command line of this process, before Hydra reads it; exit status 1 where that cannot be."""
+    try:
+        sys.argv[1:] = quote_places(sys.argv[1:])
+    except ValueError as error:
+        sys.exit(f"error: {error}")
 
 
 def command_line(module: str, overrides: Sequence[str]) -> str:
@@ -64,7 +76,16 @@ def _quoted(argument: str, several: bool) -> str:
     place = os.path.expanduser(value) if value.startswith("~/") else value
     if read == place:
         return argument
-    return _INTERPOLATION.sub(r"\1", quote_override(key, place))
+    quoted = _INTERPOLATION.sub(r"\1", quote_override(key, place))
+    if r"\${" in quoted or _has_surrogates(place):
+        raise ValueError(
+            f"command: names of files must be UTF-8 without a bare ${{, got {argument!r}"
+        )
+    return quoted
+
+
+def _has_surrogates(text: str) -> bool:
+    return any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def _read(argument: str) -> object:

@@ -11,7 +11,7 @@ from omegaconf.errors import MissingMandatoryValue
 from rich.console import Console
 from torch import Tensor
 
-from vlgs.arguments import quote_places
+from vlgs.arguments import take_command_line
 from vlgs.config import CONF, LEVELS, check_targets, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
@@ -187,5 +187,5 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]
 if __name__ == "__main__":
     if {"--help", "-h"} & set(sys.argv):
         sys.argv.append("hydra/help=check")
-    sys.argv[1:] = quote_places(sys.argv[1:])
+    take_command_line()
     main()

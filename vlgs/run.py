@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.arguments import command_line, quote_places
+from vlgs.arguments import command_line, take_command_line
 from vlgs.config import (
     CONF,
     GIVEN_FILES,
@@ -242,5 +242,5 @@ def _command() -> str:
 
 
 if __name__ == "__main__":
-    sys.argv[1:] = quote_places(sys.argv[1:])
+    take_command_line()
     main()

@@ -52,6 +52,12 @@ def test_an_interpolation_beside_odd_characters_keeps_its_meaning():
     assert quote_places(["results=/Ü/${seed}"]) == ["results='/Ü/${seed}'"]
 
 
+@pytest.mark.parametrize("name", ["/x/a${", "/x/\udcff"])
+def test_a_name_that_no_configuration_carries_is_refused(name: str):
+    with pytest.raises(ValueError, match="command: names of files must be UTF-8 without"):
+        quote_places([f"results={name}"])
+
+
 def test_a_home_folder_is_found(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", "/home/Jürgen")
     assert quote_places(["data.root=~/a b"]) == ["data.root='/home/Jürgen/a b'"]

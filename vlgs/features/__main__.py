@@ -7,7 +7,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from vlgs.arguments import quote_places
+from vlgs.arguments import take_command_line
 from vlgs.config import CONF, check_targets
 from vlgs.features import job as work
 
@@ -54,5 +54,5 @@ def extract(config: DictConfig) -> None:
 if __name__ == "__main__":
     # Hydra takes no flags of ours.
     sys.argv = ["dry_run=true" if word == "--dry-run" else word for word in sys.argv]
-    sys.argv[1:] = quote_places(sys.argv[1:])
+    take_command_line()
     main()
