@@ -1,5 +1,6 @@
 """Is this scene usable? `python -m vlgs.check data=colmap data.root=PATH` lists every fault; exit status 1 if one is an error."""
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +33,8 @@ class Report:
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
     """Print the report; see the module."""
+    # What it would say of its warnings while it loads a scene stands in the report.
+    logging.getLogger("vlgs.data.colmap").setLevel(logging.ERROR)
     try:
         check_targets(config)
         report = check(config.data)
