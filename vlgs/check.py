@@ -1,5 +1,6 @@
 """Is this scene usable? `python -m vlgs.check data=colmap data.root=PATH` lists every fault; exit status 1 if one is an error."""
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -11,6 +12,7 @@ from omegaconf.errors import MissingMandatoryValue
 from rich.console import Console
 from torch import Tensor
 
+from vlgs.arguments import take_command_line
 from vlgs.config import CONF, LEVELS, check_targets, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
@@ -32,6 +34,8 @@ class Report:
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
     """Print the report; see the module."""
+    # What it would say of its warnings while it loads a scene stands in the report.
+    logging.getLogger("vlgs.data.colmap").setLevel(logging.ERROR)
     try:
         check_targets(config)
         report = check(config.data)
@@ -151,7 +155,7 @@ def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
 
 def print_report(report: Report) -> None:
     """Summary, then errors, then warnings, then the verdict."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)
     for line in report.summary:
         console.print(screen(line))
     wrong = errors(report.faults)
@@ -187,4 +191,5 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]
 if __name__ == "__main__":
     if {"--help", "-h"} & set(sys.argv):
         sys.argv.append("hydra/help=check")
+    take_command_line()
     main()

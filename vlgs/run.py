@@ -4,7 +4,7 @@ import logging
 import os
 import resource
 import sys
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from vlgs.arguments import command_line, take_command_line
 from vlgs.config import (
     CONF,
     GIVEN_FILES,
@@ -94,7 +95,7 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
     from vlgs.module.stages import StoppedError, train_all
 
     text = _text_encoder(config, next(reversed(scenes.values())))
-    folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
+    folder.config.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
     stages = _stages(folder, config, scenes)
     try:
         sharing, augment = instantiate(config.sharing), instantiate(config.augment)
@@ -118,18 +119,24 @@ def _text_encoder(config: DictConfig, scene: Any) -> Any:
 
     A word that it does not know is an error now, not after training.
     """
-    from vlgs.query import encode_prompts
+    from vlgs.query import encode_questions, words_of
     from vlgs.query.text import VocabularyText
 
-    if not scene.classes or scene.mask_vectors.shape[0] == 0:
+    if scene.mask_vectors.shape[0] == 0:
         return None
-    text = instantiate(config.text)(vocabulary=scene.vocabulary)
+    text, query = instantiate(config.text)(vocabulary=scene.vocabulary), instantiate(config.query)
+    if not words_of(scene, query):
+        log.warning(
+            "neither labels nor a vocabulary: language is trained but nothing can be asked (data.vocabulary=FILE, which "
+            "`python -m vlgs.vocabulary words.txt FILE` makes)"
+        )
+        return None
     if isinstance(text, VocabularyText) and scene.vocabulary is None:
         log.warning(
             "no vocabulary: language is trained but not scored (data.vocabulary=FILE or text=clip)"
         )
         return None
-    encode_prompts(instantiate(config.query), text, scene.classes)
+    encode_questions(query, text, scene)
     return text
 
 
@@ -167,11 +174,12 @@ def _report(
     """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
     from vlgs.gaussians import write_ply
     from vlgs.module.stages import all_skips
-    from vlgs.report.evaluate import evaluate, prompts_of
+    from vlgs.report.evaluate import evaluate
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
     from vlgs.report.results import write_metrics, write_queries
     from vlgs.report.timing import measure_fps
+    from vlgs.report.words import questions_of
 
     model, scene = models[-1], next(reversed(scenes.values()))
     query, protocol = instantiate(config.query), instantiate(config.protocol)
@@ -179,7 +187,11 @@ def _report(
     for stage in kept:
         write_ply(stage.folder.ply, stage.model.splats)
     evaluation = evaluate(models, scene, query, text, protocol)
-    prompts, _ = prompts_of(scene, query, text)
+    asked = questions_of(model, scene, query, text)
+    prompts = asked.prompts if asked else None
+    if asked and asked.note:
+        query = asked.query
+        evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
     cameras, language = [v.camera for v in scene.test or scene.train], len(scene.mask_vectors) > 0
     timing = measure_fps(model, cameras, query, prompts, language)
     if config.pictures:
@@ -230,8 +242,9 @@ def _dataset(config: DictConfig) -> str:
 
 def _command() -> str:
     overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    return " ".join(["python -m vlgs.run", *overrides])
+    return command_line("vlgs.run", overrides)
 
 
 if __name__ == "__main__":
+    take_command_line()
     main()

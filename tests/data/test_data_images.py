@@ -1,13 +1,15 @@
 """Photographs of every kind that cameras and tools leave behind."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from colmap_scenes import picture
+from colmap_scenes import picture, write_scene
 from PIL import Image
 
+from vlgs.data.colmap import ColmapSource, load_scene, survey
 from vlgs.data.faults import SceneError
 from vlgs.data.images import is_copy_of, open_photograph, read_photograph
 
@@ -119,3 +121,31 @@ def test_scaled_copies_are_told_from_crops(
     size: tuple[int, int], camera: tuple[int, int], expected: bool
 ):
     assert is_copy_of(size, camera) == expected
+
+
+def test_transparent_pixels_are_a_warning_and_an_opaque_channel_is_not(tmp_path: Path):
+    names = write_scene(tmp_path / "opaque", n=12, points=1000)
+    for name in names:
+        path = tmp_path / "opaque" / "images" / f"{name}.png"
+        with Image.open(path) as image:
+            image.convert("RGBA").save(path)
+    shutil.copytree(tmp_path / "opaque", tmp_path / "cut out")
+    path = tmp_path / "cut out" / "images" / f"{names[0]}.png"
+    with Image.open(path) as image:
+        image.putpixel((3, 4), (255, 255, 255, 0))
+        image.save(path)
+    assert not survey(ColmapSource(root=str(tmp_path / "opaque"))).faults
+    (fault,) = survey(ColmapSource(root=str(tmp_path / "cut out"))).faults
+    assert fault.severity == "warning"
+    assert f"got transparent pixels in {names[0]}.png (an alpha channel in 12 of 12)" in str(fault)
+    assert "they are laid on black" in fault.advice
+
+
+def test_a_run_says_the_warnings_of_its_scene_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    write_scene(tmp_path, n=3, points=1000)
+    for _ in range(3):
+        load_scene(str(tmp_path))
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.startswith(f"warning: {tmp_path}: training views should be at least 6, got 2 of 3")

@@ -109,7 +109,7 @@ def test_scene_without_labels_has_no_language_scores_and_says_why():
         (None, CLASSES, "no language was trained"),
         (VocabularyText(None), CLASSES, "the scene must bring a vocabulary"),
         (VocabularyText(vocabulary(CLASSES)), CLASSES, "query=vocab_softmax"),
-        (VocabularyText(vocabulary()), (), "the scene names no classes"),
+        (VocabularyText(vocabulary()), (), "the scene has no labels"),
         (VocabularyText(vocabulary()), (*CLASSES, "zebra"), "got 'zebra'"),
     ],
 )

@@ -1,7 +1,13 @@
 """Cameras from photographs: refusals, resuming and what is left behind at once; a real reconstruction is slow."""
 
 import json
+import shlex
 import shutil
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +20,7 @@ from vlgs.data.faults import errors
 from vlgs.sfm import reconstruct as module
 from vlgs.sfm.__main__ import main
 from vlgs.sfm.compare import align, compare_poses
+from vlgs.sfm.photographs import find_photographs
 from vlgs.sfm.reconstruct import SfmOptions, reconstruct
 
 pytest.importorskip("pycolmap")
@@ -102,7 +109,10 @@ def test_a_scene_that_is_there_is_not_overwritten(tmp_path: Path):
     images = photographs(tmp_path / "images")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("x")
-    with pytest.raises(FileExistsError, match="must not exist or be empty"):
+    with pytest.raises(
+        FileExistsError,
+        match="must not exist, be empty or a scene that this command made, got a folder",
+    ):
         reconstruct(images, tmp_path / "out", SfmOptions(), QUIET)
     foreign = tmp_path / ".new.sfm"
     foreign.mkdir()
@@ -110,6 +120,102 @@ def test_a_scene_that_is_there_is_not_overwritten(tmp_path: Path):
     with pytest.raises(FileExistsError, match="must be a folder of an earlier run"):
         reconstruct(images, tmp_path / "new", SfmOptions(), QUIET)
     assert (foreign / "mine.txt").is_file()
+
+
+FAKE_WORKER = """
+import json, pathlib, sys
+folder = pathlib.Path(sys.argv[1])
+names = json.loads((folder / "settings.json").read_text(encoding="utf-8"))["names"]
+(folder / "sparse" / "0").mkdir(parents=True)
+parts = [names[:-APART], names[: len(names) // 2], names[-2:]] if APART else [names, names[:3]]
+(folder / "models.json").write_text(json.dumps([
+    {"folder": str(i), "registered": part, "points": 5, "reprojection_error": 0.5, "cameras": CAMERAS}
+    for i, part in enumerate(parts)
+]))
+(folder / "stage.txt").write_text("done")
+"""
+
+
+def fake_colmap(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, apart: int = 0, cameras: int = 1
+) -> None:
+    code = FAKE_WORKER.replace("APART", str(apart)).replace("CAMERAS", str(cameras))
+    (folder / "worker.py").write_text(code)
+    monkeypatch.setattr(module, "__file__", str(folder / "reconstruct.py"))
+
+
+def test_a_finished_scene_is_reported_and_its_command_can_be_pasted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    fake_colmap(monkeypatch, tmp_path)
+    images, out = photographs(tmp_path / "Fotos (1)", 6), tmp_path / "Ünï, [b]=c :car:"
+    main([str(images), str(out)])
+    first = capsys.readouterr().out
+    assert "6 of 6 photographs registered" in first
+    assert "warning" not in first
+    next_command = first.splitlines()[-1].removeprefix("next: ")
+    assert shlex.split(next_command)[-1] == f"data.root={out}"
+    (tmp_path / "worker.py").write_text("raise SystemExit('must not run again')")
+    main([str(images), str(out), "--threads", "1"])
+    again = capsys.readouterr().out
+    assert again.splitlines() == [
+        "this scene exists, nothing was computed",
+        *first.splitlines()[-2:],
+    ]
+    with pytest.raises(SystemExit, match="max_features 8192, now 100; delete it or choose another"):
+        main([str(images), str(out), "--max-features", "100"])
+    (images / "0.png").unlink()
+    with pytest.raises(SystemExit, match="got 6 photographs, now 5 or others"):
+        main([str(images), str(out)])
+
+
+def test_parts_are_told_only_where_photographs_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    fake_colmap(monkeypatch, tmp_path, apart=3, cameras=4)
+    main([str(photographs(tmp_path / "images", 20)), str(tmp_path / "out")])
+    said = capsys.readouterr().out
+    assert "17 of 20 photographs registered" in said
+    assert "warning: 2 more fit together (parts of 2), but not with these" in said
+    assert "4 cameras were calibrated, but by size and EXIF 1 took the photographs" in said
+    assert "--single-camera is more exact" in said
+
+
+def test_photographs_of_one_size_and_exif_camera_share_a_camera(tmp_path: Path):
+    images = photographs(tmp_path / "images", 5)
+    exif = Image.Exif()
+    exif[271], exif[272] = "Maker", "Model"
+    with Image.open(images / "3.png") as image:
+        image.copy().save(images / "3.png", exif=exif)
+    with Image.open(images / "4.png") as image:
+        image.resize((32, 24)).save(images / "4.png")
+    groups = find_photographs(images)
+    assert list(groups.values()) == [["0.png", "1.png", "2.png"], ["3.png"], ["4.png"]]
+    with pytest.raises(
+        ValueError, match=r"--single-camera must have .* of one size, got 32 x 24, 64 x 48"
+    ):
+        reconstruct(images, tmp_path / "out", SfmOptions(single_camera=True), QUIET)
+
+
+def test_a_scene_among_its_photographs_is_refused(tmp_path: Path):
+    images = photographs(tmp_path / "images")
+    with pytest.raises(ValueError, match="OUT must lie outside of the photographs"):
+        reconstruct(images, images / "scene", SfmOptions(), QUIET)
+
+
+def test_interrupted_features_go_on_with_the_same_camera(tmp_path: Path):
+    images = photographs(tmp_path / "images", 4)
+    settings = {
+        **asdict(SfmOptions(max_features=50, matching="exhaustive")), "images": str(images),
+    }  # fmt: skip
+    for names in (["0.png"], ["0.png", "1.png", "2.png", "3.png"]):
+        content = json.dumps({**settings, "names": names, "groups": [names]})
+        (tmp_path / "settings.json").write_text(content)
+        worker = Path(module.__file__).with_name("worker.py")
+        subprocess.run([sys.executable, "-P", str(worker), str(tmp_path)], capture_output=True)
+    with closing(sqlite3.connect(tmp_path / "database.db")) as base:
+        assert base.execute("SELECT COUNT(*) FROM images").fetchone() == (4,)
+        assert base.execute("SELECT COUNT(*) FROM cameras").fetchone() == (1,)
 
 
 def test_photographs_that_do_not_match_leave_no_scene(tmp_path: Path):

@@ -10,15 +10,18 @@ to a photograph (undistort, resize) it does to them.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence, Set
+import logging
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from vlgs.data.cache import PixelCache
-from vlgs.data.faults import Fault, FaultList, SceneError, errors, listing, require_sound
+from vlgs.data.faults import Fault, FaultList, SceneError, errors, listing, require_sound, warning
+from vlgs.data.images import transparency_warnings
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
 from vlgs.data.language import read_vocabulary
 from vlgs.data.masks import (
@@ -33,6 +36,14 @@ from vlgs.data.sparse import SparseModel, find_sparse, model_faults, read_sparse
 from vlgs.data.split import Split
 from vlgs.data.views import ViewSource
 from vlgs.types import Scene, Vocabulary
+
+log = logging.getLogger(__name__)
+
+_FEW_VIEWS = 6
+"""Fewer training views than this are doubted."""
+
+_MOST_WARNINGS = 8
+"""That a run says; `vlgs.check` lists all."""
 
 _VERSION = "vlgs.data.colmap 1"
 """Part of the fingerprint: to be raised when the same files lead to other pixels."""
@@ -138,8 +149,19 @@ def load_scene(root: str, **options: Any) -> Scene:
     """
     found = survey(ColmapSource(root=root, **options))
     require_sound(found.faults)
+    _say_warnings(tuple(str(fault) for fault in found.faults))
     assert found.scene is not None
     return found.scene
+
+
+@cache
+def _say_warnings(warnings: tuple[str, ...]) -> None:
+    """Say them once in a process, however often it reads the scene."""
+    for line in warnings[:_MOST_WARNINGS]:
+        log.warning("warning: %s", line)
+    if len(warnings) > _MOST_WARNINGS:
+        more = len(warnings) - _MOST_WARNINGS
+        log.warning("warning: %d more, which python -m vlgs.check lists", more)
 
 
 def survey(source: ColmapSource) -> Survey:
@@ -159,9 +181,11 @@ def survey(source: ColmapSource) -> Survey:
     )
     views = faults.take(open_views(model, images))
     faults += coverage_warnings(model, views, images)
+    faults += transparency_warnings([view.photograph for view in views], images.path)
     labels = faults.take(_open_labels(source, views))
     views = faults.take(attach_labels(views, labels, images))
     faults += source.rule.faults(*_names(views), str(source.folder))
+    faults += _few_views(source, views)
     masks = faults.take(_open_masks(source, views))
     vocabulary = faults.take(_open_vocabulary(source, masks))
     if errors(faults):
@@ -260,6 +284,16 @@ def _open_labels(
     if source.label_names == "position" and isinstance(labels, ObjectFolder):
         labels = labels.by_position(_names(views)[0])
     return labels, faults
+
+
+def _few_views(source: ColmapSource, views: Sequence[ViewSource]) -> Iterator[Fault]:
+    train, _ = source.rule.divide(*_names(views))
+    if 0 < len(train) < _FEW_VIEWS:
+        what = f"training views should be at least {_FEW_VIEWS}, got {len(train)} of {len(views)} with split={source.rule.name}"
+        advice = (
+            "so few leave most depths open, and other views will look wrong: take more photographs"
+        )
+        yield warning(source.folder, what, advice)
 
 
 def _feature_folder(source: ColmapSource) -> Path | None:

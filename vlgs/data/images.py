@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.faults import Fault, SceneError, listing, warning
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
 
@@ -28,6 +29,9 @@ UNREADABLE = (
 
 _ORIENTATION = 0x0112
 
+_DECODED = 4
+"""Photographs that are looked at for transparent pixels."""
+
 
 @dataclass(frozen=True)
 class Photograph:
@@ -41,6 +45,8 @@ class Photograph:
     """Whether the EXIF orientation is applied."""
     tagged: bool
     """Whether the file carries an EXIF orientation at all."""
+    alpha: bool = False
+    """Whether the file has an alpha channel or a transparent colour."""
 
 
 def open_photograph(path: Path, camera_size: tuple[int, int]) -> Photograph:
@@ -60,16 +66,16 @@ def open_photograph(path: Path, camera_size: tuple[int, int]) -> Photograph:
         with Image.open(path) as image:
             width, height = image.size
             orientation = image.getexif().get(_ORIENTATION, 1)
-            mode = image.mode
+            mode, alpha = image.mode, image.has_transparency_data
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
     if mode in ("I", "F"):
         raise SceneError(Fault(str(path), f"pixels must be 8 or 16 bit integers, got mode {mode}"))
     tagged = orientation not in (0, 1)
     if is_copy_of((width, height), camera_size):
-        return Photograph(path, width, height, turned=False, tagged=tagged)
+        return Photograph(path, width, height, turned=False, tagged=tagged, alpha=alpha)
     if orientation in (5, 6, 7, 8) and is_copy_of((height, width), camera_size):
-        return Photograph(path, height, width, turned=True, tagged=tagged)
+        return Photograph(path, height, width, turned=True, tagged=tagged, alpha=alpha)
     expected = f"{camera_size[0]} x {camera_size[1]} as its camera, or a scaled copy of that"
     advice = "take the images that COLMAP saw"
     raise SceneError(Fault(str(path), f"size must be {expected}, got {width} x {height}", advice))
@@ -87,6 +93,30 @@ def read_photograph(photograph: Photograph) -> UInt8[Tensor, "h w 3"]:
     except UNREADABLE as error:
         raise _unreadable(photograph.path, error) from error
     return torch.from_numpy(np.array(rgb))
+
+
+def transparency_warnings(photographs: Sequence[Photograph], folder: Path) -> Iterator[Fault]:
+    """Say that transparent pixels become black, which is trained like any other colour.
+
+    A few of the files with an alpha channel are decoded: many have one and are opaque all over.
+    """
+    channels = [photograph for photograph in photographs if photograph.alpha]
+    step = -(-len(channels) // _DECODED) or 1
+    holes = [p.path.name for p in channels[::step] if _has_transparent_pixels(p.path)]
+    if holes:
+        what = f"photographs should be opaque, got transparent pixels in {listing(holes)}"
+        if len(channels) > 1:
+            what += f" (an alpha channel in {len(channels)} of {len(photographs)})"
+        advice = "they are laid on black, which is learnt as what is there: lay them on the background that you want"
+        yield warning(folder, what, advice)
+
+
+def _has_transparent_pixels(path: Path) -> bool:
+    try:
+        with Image.open(path) as image:
+            return bool(np.asarray(image.convert("RGBA").getchannel("A")).min(initial=255) < 255)
+    except UNREADABLE:  # said where it is read
+        return False
 
 
 def is_copy_of(size: tuple[int, int], camera: tuple[int, int]) -> bool:

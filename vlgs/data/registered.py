@@ -97,7 +97,7 @@ def coverage_warnings(
         yield warning(folder.path, what, advice)
     if len(model.cameras) == len(model.images) > 1:
         what = f"images of one device should share a camera, got {len(model.cameras)} cameras"
-        advice = "each was calibrated from one image alone: run COLMAP with a single camera"
+        advice = "each was calibrated from one image alone: run COLMAP with a single camera (vlgs.sfm --single-camera)"
         yield warning(model.file("cameras"), what, advice)
     tagged = [view.photograph for view in views if view.photograph.tagged]
     outcomes = {

@@ -7,6 +7,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from vlgs.arguments import take_command_line
 from vlgs.config import CONF, check_targets
 from vlgs.features import job as work
 
@@ -38,7 +39,9 @@ def extract(config: DictConfig) -> None:
         OSError: If the scene or weights are not there, or a file cannot be written.
         ValueError: If scene, options or the folder's settings are at fault.
     """
-    console = Console(soft_wrap=True, highlight=False, markup=False, quiet=not config.progress)
+    console = Console(
+        soft_wrap=True, highlight=False, markup=False, emoji=False, quiet=not config.progress
+    )
     job = work.plan(config)
     if config.dry_run:
         for line in work.estimate(job):
@@ -51,4 +54,5 @@ def extract(config: DictConfig) -> None:
 if __name__ == "__main__":
     # Hydra takes no flags of ours.
     sys.argv = ["dry_run=true" if word == "--dry-run" else word for word in sys.argv]
+    take_command_line()
     main()

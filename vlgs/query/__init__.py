@@ -10,16 +10,20 @@ from vlgs.query.prompts import Prompts, encode_prompts
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.query.similarity import cosines, decoded_cosines
 from vlgs.query.text import TextEncoder
+from vlgs.query.words import Questions, encode_questions, words_of
 
 __all__ = [
     "LerfRelevancy",
     "Prompts",
     "Query",
+    "Questions",
     "TextEncoder",
     "VocabSoftmax",
     "cosines",
     "decoded_cosines",
     "encode_prompts",
+    "encode_questions",
+    "words_of",
 ]
 
 

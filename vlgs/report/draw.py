@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vlgs.metrics.dense import predict_classes
@@ -48,6 +48,8 @@ class ViewPictures:
     """Ids that occur in `labels` or `prediction`."""
     prompts: Mapping[str, PromptPictures] = field(default_factory=dict)
     """By prompt, the most telling first."""
+    words: Mapping[str, UInt8[Tensor, "h w 3"]] = field(default_factory=dict)
+    """Heat maps of words that are asked where nobody labelled the scene, each from its lowest to its highest in all views."""
 
 
 class Painter:
@@ -57,7 +59,7 @@ class Painter:
         model: The trained scene.
         scene: Its held-out views and labels.
         query: How relevancy is computed.
-        prompts: The scene's classes, encoded; without them there is nothing to answer.
+        prompts: The scene's classes, encoded, or words for a scene without any; without either there is nothing to answer.
         views: The views whose features set the colours, usually those that will be drawn.
     """
 
@@ -77,6 +79,7 @@ class Painter:
             answer_view(model, view.camera, None, self.fused).feature for view in views
         )
         self.times_asked = dict.fromkeys(scene.classes, 0)
+        self.ranges = None if scene.classes or prompts is None else self._ranges(views)
 
     @torch.no_grad()
     def draw(self, view: View, max_prompts: int) -> ViewPictures:
@@ -97,6 +100,8 @@ class Painter:
             )
         if self.prompts is None:
             return pictures
+        if self.ranges is not None:
+            return self._add_words(pictures, answer, self.ranges)
         truth = read_truth(view)
         units = self._choose(read_units(view, self.prompts.names, truth), max_prompts)
         prompts = self._answer_prompts(answer, pictures.photograph, units)
@@ -121,18 +126,52 @@ class Painter:
         self, answer: Answer, photograph: UInt8[Tensor, "h w 3"], units: Sequence[Unit]
     ) -> dict[str, PromptPictures]:
         assert self.prompts is not None
-        assert answer.cosines is not None  # there are prompts
-        assert answer.negatives is not None
-        relevancy = self.query.relevancy(answer.cosines, answer.negatives)
+        rows = [self.prompts.names.index(unit.category) for unit in units]
         pictures = {}
-        for unit in units:
-            raw = relevancy[self.prompts.names.index(unit.category)]
-            blended = blend(raw[None], smooth(raw[None]))[0]  # what LERF-OVS segments
+        for unit, blended in zip(units, self._blended(answer, rows), strict=True):
             pictures[unit.category] = PromptPictures(
                 relevancy=colors.heat_over(photograph, colors.stretch(blended)),
                 segmentation=colors.mask_over(photograph, segment(blended), unit.mask),
             )
         return pictures
+
+    def _blended(self, answer: Answer, rows: Sequence[int]) -> Float[Tensor, "r h w"]:
+        """Relevancy of some prompts as LERF-OVS segments it."""
+        assert answer.cosines is not None  # there are prompts
+        assert answer.negatives is not None
+        relevancy = self.query.relevancy(answer.cosines, answer.negatives)[list(rows)]
+        return blend(relevancy, smooth(relevancy))
+
+    def _ranges(self, views: Sequence[View]) -> Float[Tensor, "2 k"]:
+        """Lowest and highest relevancy of each word in all views: where it is not seen its map stays cold."""
+        assert self.prompts is not None
+        rows, bounds = range(len(self.prompts.names)), []
+        for view in views:
+            answer = answer_view(self.model, view.camera, self.prompts, self.fused)
+            bounds.append(torch.stack(self._blended(answer, rows).flatten(1).aminmax(dim=1)))
+        low, high = torch.stack(bounds).unbind(dim=1)  # [views, k] each
+        return torch.stack([low.amin(dim=0), high.amax(dim=0)])
+
+    def _add_words(
+        self, pictures: ViewPictures, answer: Answer, ranges: Float[Tensor, "2 k"]
+    ) -> ViewPictures:
+        """A heat map for each word, and the best of them for every pixel."""
+        assert self.prompts is not None
+        assert answer.cosines is not None  # there are prompts
+        low, high = ranges[..., None, None]
+        names = self.prompts.names
+        shares = (self._blended(answer, range(len(names))) - low) / (high - low).clamp_min(1e-9)
+        words = {
+            word: colors.heat_over(pictures.photograph, share)
+            for word, share in zip(names, shares, strict=True)
+        }
+        best = predict_classes([answer.cosines])
+        return replace(
+            pictures,
+            words=words,
+            prediction=colors.paint_labels(best, len(words)),
+            classes=tuple(best.unique().tolist()),
+        )
 
     def _add_classes(
         self, pictures: ViewPictures, answer: Answer, truth: UInt8[Tensor, "h w"]

@@ -39,7 +39,7 @@ class Evaluation:
     beside: Mapping[str, float | int | None] = field(default_factory=dict)
     """Further figures under the names of `vlgs.report.results.METRICS`."""
     reasons: Mapping[str, str] = field(default_factory=dict)
-    """Metric -> why it is not available; faults of the labels stand under ``labels``."""
+    """Metric -> why it is not available; faults of the labels stand under ``labels``, what the pictures ask without any under ``words``."""
     failure: str | None = None
     """Why the evaluation failed: a protocol or labels asked for scores, and nothing could be scored."""
     category_kinds: Mapping[str, str] = field(default_factory=dict)
@@ -116,7 +116,7 @@ def _is_labelled(scene: Scene) -> bool:
 def prompts_of(scene: Scene, query: Query, text: TextEncoder | None) -> tuple[Prompts | None, str]:
     """The scene's classes, encoded, or None and the reason why there are none."""
     if not scene.classes:
-        return None, "the scene names no classes"
+        return None, "the scene has no labels"
     if text is None:
         return None, "no language was trained, or there is no vocabulary"
     try:

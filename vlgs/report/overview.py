@@ -12,7 +12,6 @@ from torch import Tensor
 from vlgs.report import colors
 from vlgs.report.draw import ViewPictures
 from vlgs.text import plot
-from vlgs.types import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,9 +31,12 @@ FOOT = 1.05
 DPI = 200
 PHOTOGRAPH, RENDER, FEATURES = "photograph", "render", "language features"
 LABELS, PREDICTION = "true classes", "predicted classes"
+BEST = "best of the words asked"
 RELEVANCY, SEGMENTATION = "relevancy of a prompt", "selected pixels, true outline"
 DIFFERENCE = "indicator \N{MINUS SIGN} opacity"
 COLUMNS = (PHOTOGRAPH, RENDER, FEATURES, LABELS, PREDICTION, RELEVANCY, SEGMENTATION, DIFFERENCE)
+WORDS = 6
+"""Words of an unlabelled scene that have a column."""
 
 
 def count_difference(
@@ -60,20 +62,20 @@ def write_histogram(path: Path, density: Float[Tensor, " bins"]) -> None:
 
 
 def write_overview(
-    path: Path, scene: Scene, rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
+    path: Path, names: Sequence[str], rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
 ) -> None:
     """Draw the sheet.
 
     Args:
         path: Ends in .png, .pdf or another format of matplotlib's.
-        scene: Names the classes.
+        names: Of the classes, or of the words that are asked instead.
         rows: At least one view. A column that no row has is left out.
         density: Of l - o, see `count_difference`.
     """
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        _Sheet(scene, rows, density).figure.savefig(path, dpi=DPI)
+        _Sheet(names, rows, density).figure.savefig(path, dpi=DPI)
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,9 @@ def _tiles(row: ViewPictures) -> dict[str, _Tile]:
         tiles |= {FEATURES: _Tile(row.features), DIFFERENCE: _Tile(row.difference)}
     if row.labels is not None and row.prediction is not None:
         tiles |= {LABELS: _Tile(row.labels), PREDICTION: _Tile(row.prediction)}
+    elif row.prediction is not None:
+        tiles[BEST] = _Tile(row.prediction)
+    tiles |= {_title(word): _Tile(row.words[word]) for word in list(row.words)[:WORDS]}
     if row.prompts:
         prompt, pictures = next(iter(row.prompts.items()))
         tiles[RELEVANCY] = _Tile(pictures.relevancy, prompt)
@@ -99,16 +104,23 @@ def _tiles(row: ViewPictures) -> dict[str, _Tile]:
     return tiles
 
 
+def _title(word: str) -> str:
+    """The column of a word; quotes keep it apart from the other columns."""
+    return f"\N{LEFT DOUBLE QUOTATION MARK}{word}\N{RIGHT DOUBLE QUOTATION MARK}"
+
+
 class _Sheet:
     """Places axes in inches from the top left, because pictures must keep their shape whatever stands around them."""
 
     def __init__(
-        self, scene: Scene, rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
+        self, names: Sequence[str], rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
     ) -> None:
         from matplotlib.figure import Figure
 
         tiles = [_tiles(row) for row in rows]
-        columns = [c for c in COLUMNS if any(c in row for row in tiles)]
+        words = [_title(word) for word in list(rows[0].words)[:WORDS]]
+        known = [PHOTOGRAPH, RENDER, FEATURES, BEST, *words, *COLUMNS[3:]]
+        columns = [c for c in known if any(c in row for row in tiles)]
         heights = [TILE * row.photograph.shape[0] / row.photograph.shape[1] for row in rows]
         self.width = 2 * MARGIN + len(columns) * (TILE + GAP)
         foot = FOOT if DIFFERENCE in columns else 0
@@ -127,9 +139,10 @@ class _Sheet:
         if DIFFERENCE not in columns:
             return
         shown = sorted({i for row in rows for i in row.classes})
-        self._legend(scene, shown, y + 0.1, columns=len(columns) - 3)
-        if RELEVANCY in columns:
-            self._heat_scale(self._left(columns.index(RELEVANCY)), y + 0.1)
+        scales = [c for c in (RELEVANCY, *words[-1:]) if c in columns]
+        for column in scales:
+            self._heat_scale(self._left(columns.index(column)), y + 0.1)
+        self._legend(names, shown, y + 0.1, columns=len(columns) - 3)
         last = self._left(columns.index(DIFFERENCE))
         _draw_histogram(self._axes(last, y + 0.1, TILE, FOOT - 0.35), density)
 
@@ -148,12 +161,12 @@ class _Sheet:
             fontsize=size, rotation=rotation, ha="center", va="center",
         )  # fmt: skip
 
-    def _legend(self, scene: Scene, classes: Sequence[int], y: float, columns: int) -> None:
+    def _legend(self, names: Sequence[str], shown: Sequence[int], y: float, columns: int) -> None:
         """Colours of the class maps that occur on the sheet."""
         from matplotlib.patches import Patch
 
-        palette = (colors.label_colors(len(scene.classes)).double() / 255).numpy()
-        handles = [Patch(color=palette[i], label=plot(scene.classes[i])) for i in classes]
+        palette = (colors.label_colors(len(names)).double() / 255).numpy()
+        handles = [Patch(color=palette[i], label=plot(names[i])) for i in shown]
         if handles:
             self.figure.legend(
                 handles=handles, loc="upper left", ncols=columns, frameon=False, fontsize=8,

@@ -28,6 +28,8 @@ class PictureLimits:
     """Prompts per view."""
     rows: int = 4
     """Views on the overview."""
+    words: int = 12
+    """Words of the vocabulary that are asked where nobody labelled the scene."""
 
 
 def write_pictures(
@@ -45,8 +47,8 @@ def write_pictures(
         model: The trained scene.
         scene: Its held-out views and labels.
         query: How relevancy is computed.
-        prompts: The scene's classes, encoded; without them only colour, features and l - o are drawn, and
-            colour alone where no language was trained.
+        prompts: The scene's classes, encoded, or words for a scene without any; without either only colour, features and
+            l - o are drawn, and colour alone where no language was trained.
         limits: How many views and prompts.
 
     Returns:
@@ -72,7 +74,7 @@ def write_pictures(
     if painter.has_language:
         write_histogram(folder / "indicator_minus_opacity.png", density)
     path = folder / "overview.png"
-    write_overview(path, scene, rows, density)
+    write_overview(path, prompts.names if prompts else (), rows, density)
     return path
 
 
@@ -96,6 +98,8 @@ def write_view(folder: Path, pictures: ViewPictures, names: Mapping[str, str]) -
     for prompt, answer in pictures.prompts.items():
         named[f"relevancy_{names[prompt]}"] = answer.relevancy
         named[f"segmentation_{names[prompt]}"] = answer.segmentation
+    for word, heat in pictures.words.items():
+        named[f"relevancy_{names[word]}"] = heat
     for name, picture in named.items():
         if picture is not None:
             _save(folder / f"{name}.png", picture)

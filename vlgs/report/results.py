@@ -87,7 +87,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "machine": ("", "cpu, cores, threads, torch, platform"),
     "per_view": ("", "held-out view -> psnr, ssim"),
     "failure": ("", "why nothing could be scored although it was asked for; null for a good run"),
-    "reasons": ("", "metric that is null -> why"),
+    "reasons": (
+        "",
+        "metric that is null -> why; under `words` what the pictures ask of a scene without labels",
+    ),
 }
 """Entry of metrics.json -> (unit or range, meaning). An entry that could not be computed is null."""
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from vlgs.arguments import command_line
 from vlgs.data.faults import listing
 from vlgs.sfm.compare import compare_poses
-from vlgs.sfm.reconstruct import ADVICE, Reconstruction, SfmOptions, reconstruct
+from vlgs.sfm.reconstruct import ADVICE, SfmOptions, reconstruct
+from vlgs.sfm.result import Reconstruction
 
 _FEW = 0.9
 """Share of registered photographs below which advice is given."""
@@ -24,7 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "OUT becomes a scene for data=colmap; an interrupted run goes on with the same command.",
     )
     parser.add_argument("images", type=Path, help="folder of photographs")
-    parser.add_argument("out", type=Path, help="folder of the scene, to be made")
+    parser.add_argument(
+        "out", type=Path, help="folder of the scene, to be made; what is finished there is reported"
+    )
     default = SfmOptions()
     parser.add_argument(
         "--matching",
@@ -41,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--single-camera",
         action=argparse.BooleanOptionalAction,
-        help="whether one camera took them all (default: if all have one size)",
+        help="whether one camera took them all (default: those of one size, with one camera and focal length in EXIF)",
     )
     parser.add_argument(
         "--max-size", type=int, default=default.max_size, help="pixels (%(default)s)"
@@ -63,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     args = vars(parser.parse_args(arguments))
     images, out, reference = args.pop("images"), args.pop("out"), args.pop("reference")
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)
     try:
         options = SfmOptions(camera_model=args.pop("camera"), **args)
         _report(console, out, reconstruct(images, out, options, console))
@@ -85,14 +89,21 @@ def _report(console: Console, out: Path, result: Reconstruction) -> None:
         f"{result.registered} of {result.photographs} photographs registered, {result.points} points, "
         f"{result.reprojection_error:.2f} pixels mean reprojection error: {out}"
     )
-    if result.models > 1:
+    if result.apart:
         console.print(
-            f"warning: the photographs fall into {result.models} parts, of which this is the largest",
+            f"warning: {sum(result.apart)} more fit together (parts of {listing(map(str, result.apart))}), but not with these; they "
+            "are left out, as nothing says how the parts lie to each other",
+            style="yellow",
+        )
+    if result.cameras > result.devices:
+        console.print(
+            f"warning: {result.cameras} cameras were calibrated, but by size and EXIF {result.devices} took the photographs; "
+            f"{'--single-camera' if result.devices == 1 else 'without --no-single-camera it'} is more exact",
             style="yellow",
         )
     if result.registered < _FEW * result.photographs:
         console.print(f"warning: no camera for {listing(result.missing)}; {ADVICE}", style="yellow")
-    console.print(f"next: python -m vlgs.check data=colmap data.root={out}")
+    console.print(f"next: {command_line('vlgs.check', ['data=colmap', f'data.root={out}'])}")
 
 
 if __name__ == "__main__":

@@ -13,15 +13,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vlgs.data.faults import listing
-from vlgs.data.images import SUFFIXES, UNREADABLE
 from vlgs.files import write_atomically
-
-REPORT = "sfm.json"
+from vlgs.sfm.photographs import find_photographs
+from vlgs.sfm.result import REPORT, Reconstruction, count_apart, read_finished
 
 _EXHAUSTIVE_UP_TO = 120
 """Photographs beyond which matching=auto goes through them in order: 120 make 7140 pairs."""
@@ -42,7 +40,7 @@ class SfmOptions:
     camera_model: str = "SIMPLE_RADIAL"
     """A model of COLMAP's; OPENCV for strong distortion."""
     single_camera: bool | None = None
-    """Whether one camera took them all; None: if all have one size."""
+    """Whether one camera took them all; None: one took those of one size and one camera and focal length in their EXIF."""
     max_size: int = 3200
     """Larger photographs are shrunk to this for finding features."""
     max_features: int = 8192
@@ -61,23 +59,8 @@ class SfmOptions:
             raise ValueError(f"sfm: numbers must be positive, got {self}")
 
 
-@dataclass(frozen=True)
-class Reconstruction:
-    """What came out."""
-
-    photographs: int
-    registered: int
-    points: int
-    reprojection_error: float
-    """Mean over the points, in pixels."""
-    models: int
-    """Parts that were found; the largest is the scene."""
-    missing: tuple[str, ...]
-    """Names of the photographs without a camera."""
-
-
 def reconstruct(images: Path, out: Path, options: SfmOptions, console: Console) -> Reconstruction:
-    """Find the cameras of all photographs of a folder and write a scene.
+    """Find the cameras of all photographs of a folder and write a scene; one that is there is only reported.
 
     The work lies in ``.<out>.sfm`` beside the scene until that is whole; the same call takes up what is there.
 
@@ -89,21 +72,33 @@ def reconstruct(images: Path, out: Path, options: SfmOptions, console: Console) 
 
     Raises:
         FileNotFoundError: If there is no such folder.
-        FileExistsError: If `out` is there already and not empty.
+        FileExistsError: If `out` is there already, and neither empty nor what this call would make.
         ValueError: If photographs cannot be read, or no cameras are found; it says what to do.
         RuntimeError: If COLMAP stops; it says where its log is.
     """
-    names, single = _photographs(images)
-    if out.is_dir() and any(out.iterdir()):
-        raise FileExistsError(f"sfm: {out} must not exist or be empty, got a folder with files")
+    by_device = find_photographs(images)
+    groups = list(by_device.values())
+    names = sorted(name for group in groups for name in group)
     chosen = asdict(options)
-    if options.single_camera is None:
-        chosen["single_camera"] = single
+    if options.single_camera:
+        if len(sizes := {size for size, _ in by_device}) > 1:
+            listed = listing(f"{width} x {height}" for width, height in sorted(sizes))
+            raise ValueError(
+                f"sfm: --single-camera must have photographs of one size, got {listed}"
+            )
+        groups = [names]
     if options.matching == "auto":
         many = len(names) > _EXHAUSTIVE_UP_TO
         chosen["matching"] = "sequential" if many else "exhaustive"
-    work = out.with_name(f".{out.name}.sfm")
-    _prepare(work, {**chosen, "images": str(images.resolve()), "names": names})
+    made = {"options": {k: v for k, v in chosen.items() if k != "threads"}, "names": names}
+    if out.exists() and (found := read_finished(out, made)) is not None:
+        console.print("this scene exists, nothing was computed")
+        return found
+    place = out.resolve()
+    if place.is_relative_to(images.resolve()):
+        raise ValueError(f"sfm: OUT must lie outside of the photographs in {images}, got {out}")
+    work = place.with_name(f".{place.name}.sfm")
+    _prepare(work, {**chosen, "images": str(images.resolve()), "names": names, "groups": groups})
     _run(work, console, len(names), _pairs(len(names), chosen["matching"], options.overlap))
     models = json.loads((work / "models.json").read_text(encoding="utf-8"))
     if not models:
@@ -117,11 +112,13 @@ def reconstruct(images: Path, out: Path, options: SfmOptions, console: Console) 
         registered=len(registered),
         points=best["points"],
         reprojection_error=best["reprojection_error"],
-        models=len(models),
+        apart=count_apart(registered, [set(model["registered"]) for model in models]),
         missing=tuple(name for name in names if name not in registered),
+        cameras=best["cameras"],
+        devices=len(groups),
     )
     sparse = work / "sparse" / best["folder"]
-    _assemble(work, sparse, None if options.undistort else images, out, result)
+    _assemble(work, sparse, None if options.undistort else images, place, (result, made))
     return result
 
 
@@ -130,31 +127,6 @@ ADVICE = (
     "overlap; use --matching exhaustive if names are not in order, --overlap 20 for a fast video, --camera OPENCV for a wide "
     "lens, --max-features 16384 for plain walls; leave out blurred ones"
 )
-
-
-def _photographs(images: Path) -> tuple[list[str], bool]:
-    """Names below the folder, in order, and whether all have one size."""
-    if not images.is_dir():
-        raise FileNotFoundError(f"sfm: images must be a folder of photographs, got {images}")
-    paths = sorted(p for p in images.rglob("*") if p.suffix.lower() in SUFFIXES)
-    sizes, broken = set(), []
-    for path in paths:
-        try:
-            with Image.open(path) as image:
-                sizes.add(image.size)
-        except UNREADABLE as error:
-            broken.append(f"{path.name} ({error})")
-    if broken:
-        raise ValueError(f"sfm: photographs must be readable, got {listing(broken)}")
-    if len(paths) < 3:
-        raise ValueError(f"sfm: photographs must be at least 3, got {len(paths)} in {images}")
-    stems = [path.stem for path in paths]
-    if len(set(stems)) < len(stems):
-        twice = sorted({stem for stem in stems if stems.count(stem) > 1})
-        raise ValueError(
-            f"sfm: photographs must have different names, got {listing(twice)} more than once"
-        )
-    return [path.relative_to(images).as_posix() for path in paths], len(sizes) == 1
 
 
 def _prepare(work: Path, settings: dict[str, Any]) -> None:
@@ -255,7 +227,11 @@ def _pairs(count: int, matching: str, overlap: int) -> int:
 
 
 def _assemble(
-    work: Path, sparse: Path, images: Path | None, out: Path, result: Reconstruction
+    work: Path,
+    sparse: Path,
+    images: Path | None,
+    out: Path,
+    report: tuple[Reconstruction, dict[str, Any]],
 ) -> None:
     """Put the scene together beside the work and move it to its place in one step.
 
@@ -274,7 +250,8 @@ def _assemble(
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(images / name, target)
     shutil.copytree(sparse, scene / "sparse" / "0")
-    text = json.dumps(asdict(result), indent=2) + "\n"
+    result, made = report
+    text = json.dumps({**asdict(result), "made": made}, indent=2) + "\n"
     write_atomically(scene / REPORT, text.encode())
     os.sync()
     scene.rename(out)

@@ -9,6 +9,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 
 def main() -> None:
@@ -22,22 +23,26 @@ def main() -> None:
     pycolmap.set_random_seed(seed)
 
     _stage(folder, "features")
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = settings["camera_model"]
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads, extraction.use_gpu = threads, False
     extraction.max_image_size = settings["max_size"]
     extraction.sift.max_num_features = settings["max_features"]
-    mode = pycolmap.CameraMode.SINGLE if settings["single_camera"] else pycolmap.CameraMode.AUTO
-    pycolmap.extract_features(
-        database,
-        images,
-        settings["names"],
-        camera_mode=mode,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
+    apart = settings["single_camera"] is False
+    for names in [settings["names"]] if apart else settings["groups"]:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = settings["camera_model"]
+        if not apart and (known := _camera(pycolmap, database, names)) is not None:
+            # Taken up again, COLMAP would calibrate one camera more for what is left.
+            reader.existing_camera_id = known
+        pycolmap.extract_features(
+            database,
+            images,
+            names,
+            camera_mode=pycolmap.CameraMode.AUTO if apart else pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
 
     _stage(folder, "matches")
     matching = pycolmap.FeatureMatchingOptions()
@@ -89,12 +94,22 @@ def main() -> None:
             "folder": str(key),
             "registered": sorted(model.image(i).name for i in model.reg_image_ids()),
             "points": model.num_points3D(),
+            "cameras": len({model.image(i).camera_id for i in model.reg_image_ids()}),
             "reprojection_error": model.compute_mean_reprojection_error(),
         }
         for key, model in models.items()
     ]
     (folder / "models.json").write_text(json.dumps(found), encoding="utf-8")
     _stage(folder, "done")
+
+
+def _camera(pycolmap: Any, database: Path, names: list[str]) -> int | None:
+    """Camera that some of the photographs have already."""
+    if not database.is_file():
+        return None
+    with pycolmap.Database.open(database) as base:
+        there = {image.name: image.camera_id for image in base.read_all_images()}
+    return next((there[name] for name in names if name in there), None)
 
 
 def _stage(folder: Path, name: str) -> None:
