@@ -164,6 +164,7 @@ def _report(
     """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
     from vlgs.gaussians import write_ply
     from vlgs.module.stages import all_skips
+    from vlgs.render.cloud import point_cloud
     from vlgs.report.evaluate import evaluate, prompts_of
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
@@ -173,8 +174,10 @@ def _report(
     model, scene = models[-1], next(reversed(scenes.values()))
     query, protocol = instantiate(config.query), instantiate(config.protocol)
     done, kept = stages.done.values(), stages.kept
+    cameras = [view.camera for view in scene.train]
     for stage in kept:
-        write_ply(stage.folder.ply, stage.model.splats)
+        cloud = point_cloud(stage.model, cameras, stage.color)
+        write_ply(stage.folder.ply, cloud.params, notes=cloud.notes)
     evaluation = evaluate(models, scene, query, text, protocol)
     prompts, _ = prompts_of(scene, query, text)
     timing = measure_fps(model, [view.camera for view in scene.test or scene.train], query, prompts)
