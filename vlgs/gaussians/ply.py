@@ -127,7 +127,7 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
     if "packed_position" in present:
         raise ValueError(
             f"ply {path}: must be uncompressed, got the compressed.ply of PlayCanvas and SuperSplat; export it as PLY "
-            f"there, or: npx @playcanvas/splat-transform IN plain.ply"
+            "there, or: npx @playcanvas/splat-transform IN plain.ply"
         )
     n_rest = sum(name.startswith("f_rest_") for name in present)
     if n_rest not in [3 * count for count in SH_COEFFICIENTS]:

@@ -56,7 +56,7 @@ def point_cloud(model: SplatModel, cameras: Sequence[Camera], color: bool = True
         fused = model.fuse()
         # As a difference, so that a colour that fusion leaves alone keeps its bits.
         params["sh0"] += (fused.color - sh_to_rgb(params["sh0"])) / SH_C0
-        params["features"] = fused.feature
+        params["features"] = fused.feature.clone()
         notes = ["f_dc f_rest: colour after fusion, exact"]
     params["indicator_logits"] = _weight_logits(model)
     if color:
