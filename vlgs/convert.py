@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from vlgs.data.sparse import read_cameras, write_transforms
+from vlgs.data.sparse import find_sparse, read_cameras, write_transforms
 from vlgs.data.sparse.write import write_colmap
 from vlgs.interchange import (
     FORMATS,
@@ -14,10 +14,11 @@ from vlgs.interchange import (
     write_autoencoder,
     write_gaussians,
 )
+from vlgs.runs import RunFolder
 
 _HELP = """Formats, by suffix; --as says which where a suffix has several:
 
-  Gaussians     IN .ply .splat .pth -> OUT {gaussians}
+  Gaussians     IN .ply .splat .pth, or the folder of a run -> OUT {gaussians}
   autoencoder   IN best_ckpt.pth -> OUT .safetensors (ours), or back
   language      IN language_features/ --codec best_ckpt.pth -> OUT language_features_dim3/
   cameras       IN a scene's folder (COLMAP) or transforms.json -> OUT transforms.json, or a folder for COLMAP's files
@@ -70,6 +71,9 @@ def convert(
     if codec is not None:
         count = compress_language(source, target, read_autoencoder(codec))
         return [f"{target}: language codes of {count} views"]
+    if _is_run(source):
+        source, lines = _point_cloud_of(source)
+        return lines + _convert_gaussians(source, target, name, drop)
     if source.is_dir() or source.suffix == ".json":
         return _convert_cameras(source, target, name)
     if source.suffix == ".safetensors" or target.suffix == ".safetensors":
@@ -77,8 +81,31 @@ def convert(
     return _convert_gaussians(source, target, name, drop)
 
 
+def _is_run(source: Path) -> bool:
+    run = RunFolder(source)
+    return (run.config.is_file() or run.ply.is_file()) and find_sparse(source) is None
+
+
+def _point_cloud_of(folder: Path) -> tuple[Path, list[str]]:
+    """The Gaussians that a run's pictures show, and, where it has several models, a line that says which these are."""
+    found = sorted(folder.rglob(RunFolder(folder).ply.name))
+    # Colour lies apart with sharing=none; with levels=separate the pictures show the last level, of whole objects.
+    colored = [path for path in found if path.parent.name != "language"]
+    if not colored:
+        what = "must have a point_cloud.ply, got none; the command of the run finishes it"
+        raise FileNotFoundError(f"convert: run {folder} {what}")
+    chosen = colored[-1]
+    others = ", ".join(str(path.relative_to(folder)) for path in found if path != chosen)
+    says = f"from {chosen.relative_to(folder)}; the run also has {others}"
+    return chosen, [says] if others else []
+
+
 def _convert_gaussians(source: Path, target: Path, name: str | None, drop: bool) -> list[str]:
     matching = [key for key, (suffix, _) in FORMATS.items() if suffix == target.suffix]
+    if target.name.lower().endswith(".compressed.ply"):
+        raise ValueError(
+            f"convert: OUT must end in plain .ply, got {target.name}, a format of PlayCanvas that is not written"
+        )
     if name is None and not matching:
         suffixes = ", ".join(dict.fromkeys(suffix for suffix, _ in FORMATS.values()))
         raise ValueError(f"convert: OUT must end in {suffixes}, got {target.name}")
@@ -96,7 +123,8 @@ def _convert_gaussians(source: Path, target: Path, name: str | None, drop: bool)
     lost = write_gaussians(target, read, name)
     lines = [f"{target}: {len(read.params['means'])} Gaussians as {FORMATS[name][1]}"]
     lines += [f"left out: {count} rows, {what}" for what, count in read.dropped.items()]
-    return lines + [f"not kept: {what}" for what in lost]
+    lines += [f"not kept: {what}" for what in lost]
+    return lines + ([f"beware: {read.doubt}"] if read.doubt else [])
 
 
 def _convert_autoencoder(source: Path, target: Path) -> list[str]:

@@ -174,6 +174,7 @@ def _report(
     """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
     from vlgs.gaussians import write_ply
     from vlgs.module.stages import all_skips
+    from vlgs.render.cloud import point_cloud
     from vlgs.report.evaluate import evaluate
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
@@ -185,7 +186,8 @@ def _report(
     query, protocol = instantiate(config.query), instantiate(config.protocol)
     done, kept = stages.done.values(), stages.kept
     for stage in kept:
-        write_ply(stage.folder.ply, stage.model.splats)
+        cloud = point_cloud(stage.model, [view.camera for view in scene.train], stage.color)
+        write_ply(stage.folder.ply, cloud.params, notes=cloud.notes)
     evaluation = evaluate(models, scene, query, text, protocol)
     asked = questions_of(model, scene, query, text)
     prompts = asked.prompts if asked else None

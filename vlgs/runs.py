@@ -63,7 +63,7 @@ class RunFolder:
 
     @property
     def ply(self) -> Path:
-        """Gaussians in the layout that other viewers open."""
+        """Gaussians as other viewers draw them: after fusion."""
         return self.path / "point_cloud.ply"
 
     def finished(self) -> dict[str, Any] | None:

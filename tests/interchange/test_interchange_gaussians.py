@@ -274,7 +274,11 @@ def test_a_splat_file_that_goes_through_us_keeps_its_bytes(
 def test_what_a_splat_keeps_of_gaussians(tmp_path: Path):
     params = random_params(200)
     lost = write_gaussians(tmp_path / "a.splat", imported(params), "splat")
-    assert lost == ("spherical harmonics above degree 0", "language features", "indicators")
+    bright = "colours above 1, of 21 Gaussians"
+    assert lost == (
+        *("spherical harmonics above degree 0", bright),
+        *("language features", "indicators"),
+    )
     got = read_gaussians(tmp_path / "a.splat").params
     assert torch.equal(got["means"], params["means"])
     opacity = got["opacity_logits"].sigmoid() - params["opacity_logits"].sigmoid()

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 from colmap_scenes import pycolmap, write_scene
+from plyfile import PlyData, PlyElement
 from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 
 from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert, main
 from vlgs.gaussians import PARAMETERS, read_ply, write_ply
+from vlgs.gaussians.ply import PLAIN
 from vlgs.interchange import write_autoencoder
 from vlgs.run import run
 from vlgs.types import Scene
@@ -33,7 +35,7 @@ def some_gaussians(n: int = 40, width: int = 3) -> dict[str, torch.Tensor]:
 def test_the_command_says_what_it_did_and_what_is_lost(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    write_ply(tmp_path / "a.ply", some_gaussians())
+    write_ply(tmp_path / "a.ply", some_gaussians(), notes=[PLAIN])
     main([str(tmp_path / "a.ply"), str(tmp_path / "b.splat")])
     out = capsys.readouterr().out.splitlines()
     assert out[0].endswith(
@@ -41,6 +43,7 @@ def test_the_command_says_what_it_did_and_what_is_lost(
     )
     assert out[1:] == [
         "not kept: spherical harmonics above degree 0",
+        "not kept: colours above 1, of 3 Gaussians",
         "not kept: language features",
         "not kept: indicators",
     ]
@@ -59,6 +62,17 @@ def test_a_chain_of_formats_ends_where_it_began(tmp_path: Path):
     assert all(torch.equal(back[k], params[k]) for k in PARAMETERS if k != "indicator_logits")
 
 
+def write_compressed(path: Path) -> None:
+    """As PlayCanvas and SuperSplat do: bounds of 256 Gaussians at a time, and four packed words for each."""
+    bounds = [f"{end}_{what}" for what in ("x", "scale_x") for end in ("min", "max")]
+    packed = [f"packed_{what}" for what in ("position", "rotation", "scale", "color")]
+    elements = [
+        PlyElement.describe(np.zeros(1, [(name, "<f4") for name in bounds]), "chunk"),
+        PlyElement.describe(np.zeros(2, [(name, "<u4") for name in packed]), "vertex"),
+    ]
+    PlyData(elements, byte_order="<").write(str(path))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -69,6 +83,10 @@ def test_a_chain_of_formats_ends_where_it_began(tmp_path: Path):
         (["a.ply", "b.ply", "--as", "splat"], "OUT must end in .splat for --as splat"),
         (["a.ply", "none/b.ply"], "No such file or directory"),
         (["bad.splat", "b.ply"], "log_scales must be finite, got 2 of 2 rows that are not"),
+        (["a.spz", "b.ply"], "got a.spz, Niantic's compressed Gaussians; SuperSplat exports it"),
+        (["a.compressed.ply", "b.splat"], "must be uncompressed, got the compressed.ply of PlayC"),
+        (["a.ply", "b.compressed.ply"], "OUT must end in plain .ply, got b.compressed.ply"),
+        (["unfinished", "b.ply"], "must have a point_cloud.ply, got none; the command of the run"),
     ],
 )
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
@@ -76,6 +94,10 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
 ):
     write_ply(tmp_path / "a.ply", some_gaussians())
     (tmp_path / "bad.splat").write_bytes(bytes(64))
+    (tmp_path / "a.spz").write_bytes(b"\x1f\x8b")
+    write_compressed(tmp_path / "a.compressed.ply")
+    (tmp_path / "unfinished").mkdir()
+    (tmp_path / "unfinished" / "config.yaml").write_text("seed: 0\n")
     before = sorted(tmp_path.iterdir())
     paths = [str(tmp_path / name) for name in arguments[:2]]
     with pytest.raises(SystemExit) as stopped:

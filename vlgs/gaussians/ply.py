@@ -5,7 +5,7 @@ Three dialects differ in what follows the rotation: ours ``lang_0`` ... and ``in
 """
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -24,11 +24,18 @@ Dialect = Literal["vlgs", "3dgs", "feature3dgs"]
 SH_COEFFICIENTS = (0, 3, 8, 15)
 """Coefficients per colour channel above degree 0, for degrees 0 to 3."""
 
+PLAIN = "vlgs: Gaussians as they are drawn; no fusion is left to be done"
+"""First note of a file that says of itself what it holds; see `write_ply`."""
+
+_NOTES_END = 4096
+"""Notes stand in the first bytes of a header, before its properties."""
+
 
 def write_ply(
     path: str | Path,
     params: nn.ParameterDict | Mapping[str, Tensor],
     dialect: Dialect = "vlgs",
+    notes: Sequence[str] = (),
 ) -> None:
     """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
 
@@ -40,6 +47,7 @@ def write_ply(
         path: The file; its folder must exist.
         params: The keys of `vlgs.gaussians.PARAMETERS`.
         dialect: ``3dgs`` leaves language out, ``feature3dgs`` calls the codes ``semantic_0`` ... and leaves the indicator out.
+        notes: ASCII lines for the header, `PLAIN` first; without it, nobody knows whether the parameters wait for a fusion.
 
     Raises:
         ValueError: If a value is not finite or a quaternion is zero; names the parameter and how many rows.
@@ -72,7 +80,8 @@ def write_ply(
     for name, column in named:
         vertices[name] = column.numpy()
     stream = io.BytesIO()
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(stream)
+    element = PlyElement.describe(vertices, "vertex")
+    PlyData([element], byte_order="<", comments=notes).write(stream)
     write_atomically(Path(path), stream.getvalue())
 
 
@@ -95,6 +104,16 @@ def read_ply(path: str | Path, feature_dim: int = 3) -> dict[str, Tensor]:
     return params
 
 
+def read_notes(path: str | Path) -> tuple[str, ...]:
+    """What a file says of itself: the notes of `write_ply`; empty where the first is not `PLAIN`."""
+    with Path(path).open("rb") as file:
+        header, _, _ = file.read(_NOTES_END).partition(b"end_header")
+    lines = header.decode("ascii", errors="replace").split("\n")
+    notes = tuple(line.removeprefix("comment ") for line in lines if line.startswith("comment "))
+    ours = notes[:1] == (PLAIN,) and all(note.isascii() and note.isprintable() for note in notes)
+    return notes if ours else ()
+
+
 def parse_ply(path: str | Path) -> dict[str, Tensor]:
     """What a file holds of `vlgs.gaussians.PARAMETERS`, not yet judged: `features` and `indicator_logits` may be missing.
 
@@ -105,6 +124,11 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
     path = Path(path)
     vertices = _read_vertices(path)
     present = set(vertices.dtype.names or ())
+    if "packed_position" in present:
+        raise ValueError(
+            f"ply {path}: must be uncompressed, got the compressed.ply of PlayCanvas and SuperSplat; export it as PLY "
+            "there, or: npx @playcanvas/splat-transform IN plain.ply"
+        )
     n_rest = sum(name.startswith("f_rest_") for name in present)
     if n_rest not in [3 * count for count in SH_COEFFICIENTS]:
         raise ValueError(f"ply {path}: f_rest properties must be 0, 9, 24 or 45, got {n_rest}")

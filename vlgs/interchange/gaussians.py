@@ -7,7 +7,8 @@ from pathlib import Path
 from torch import Tensor
 
 from vlgs.gaussians.parameters import complete
-from vlgs.gaussians.ply import parse_ply, write_ply
+from vlgs.gaussians.ply import PLAIN, parse_ply, read_notes, write_ply
+from vlgs.gaussians.sh import sh_to_rgb
 from vlgs.gaussians.sound import drop_broken, require_sound
 from vlgs.interchange.checkpoint import parse_checkpoint, write_checkpoint
 from vlgs.interchange.splat import parse_splat, write_splat
@@ -23,6 +24,11 @@ FORMATS: Mapping[str, tuple[str, str]] = {
 """Name -> suffix and what it is."""
 
 _CHECKPOINTS = (".pth", ".pt", ".ckpt")
+_UNREAD = {
+    ".spz": "Niantic's compressed Gaussians",
+    ".ksplat": "mkkellogg's compressed Gaussians",
+    ".sog": "PlayCanvas's compressed Gaussians",
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,18 @@ class Imported:
     """Whether the file is a checkpoint of LangSplat, whose features are normalised before they are rendered."""
     dropped: Mapping[str, int]
     """What was wrong with how many rows that were left out."""
+    notes: tuple[str, ...] = (PLAIN,)
+    """What a file of ours says of itself; empty where it should and does not."""
+
+    @property
+    def doubt(self) -> str | None:
+        """What is not known of the colours: vlgs used to write those before fusion, which no other program applies."""
+        if self.notes:
+            return None
+        return (
+            "the file does not say whether its colours and codes are those after fusion; a run of an older vlgs writes "
+            "one that does when its metrics.json is deleted and its command repeated (nothing is trained again)"
+        )
 
 
 def read_gaussians(path: str | Path, feature_dim: int = 3, drop: bool = False) -> Imported:
@@ -58,6 +76,12 @@ def read_gaussians(path: str | Path, feature_dim: int = 3, drop: bool = False) -
         params = parse_splat(path)
     elif path.suffix in _CHECKPOINTS:
         params, _ = parse_checkpoint(path)
+    elif path.suffix.lower() in _UNREAD:
+        what = f"{path.name}, {_UNREAD[path.suffix.lower()]}"
+        raise ValueError(
+            f"gaussians: file must be .ply, .splat or {', '.join(_CHECKPOINTS)}, got {what}; "
+            "SuperSplat exports it as PLY, and so does: npx @playcanvas/splat-transform IN plain.ply"
+        )
     else:
         raise ValueError(
             f"gaussians: file must end in .ply, .splat or {', '.join(_CHECKPOINTS)}, got {path.name}"
@@ -66,7 +90,10 @@ def read_gaussians(path: str | Path, feature_dim: int = 3, drop: bool = False) -
     require_sound(f"{path.suffix[1:]} {path}", params)
     language = "features" in params
     in_checkpoint = path.suffix in _CHECKPOINTS
-    return Imported(complete(params, feature_dim), language, language and in_checkpoint, dropped)
+    own = path.suffix == ".ply" and "indicator_logits" in params
+    notes = read_notes(path) if own else (PLAIN,)
+    params = complete(params, feature_dim)
+    return Imported(params, language, language and in_checkpoint, dropped, notes)
 
 
 def write_gaussians(path: str | Path, imported: Imported, name: str) -> tuple[str, ...]:
@@ -85,7 +112,7 @@ def write_gaussians(path: str | Path, imported: Imported, name: str) -> tuple[st
         raise ValueError(f"{name} {path}: Gaussians must carry language features, got none")
     if name in ("vlgs", "3dgs-ply", "feature3dgs"):
         dialect = "3dgs" if name == "3dgs-ply" else name
-        write_ply(path, params, dialect)
+        write_ply(path, params, dialect, imported.notes if name == "vlgs" else ())
     elif name == "splat":
         write_splat(path, params)
     elif name in ("3dgs", "langsplat"):
@@ -99,10 +126,14 @@ def _lost(imported: Imported, name: str) -> list[str]:
     params, lost = imported.params, []
     if name == "splat" and params["shN"].abs().sum() > 0:
         lost.append("spherical harmonics above degree 0")
+    if name == "splat" and (bright := int((sh_to_rgb(params["sh0"]) > 1).any(dim=1).sum())):
+        lost.append(f"colours above 1, of {bright} Gaussians")
     if name in ("splat", "3dgs-ply", "3dgs") and imported.has_language:
         lost.append("language features")
     if name != "vlgs" and not params["indicator_logits"].equal(params["opacity_logits"]):
         lost.append("indicators")
+    if name == "langsplat" and (params["features"].norm(dim=1) - 1).abs().gt(1e-3).any():
+        lost.append("lengths of language codes, in LangSplat's pictures")
     if name != "vlgs" and "language_quats" in params:
         lost.append("covariances of language's own")
     return lost

@@ -30,6 +30,8 @@ def start_from(path: str | Path, config: GaussiansConfig, feature_dim: int) -> d
         ValueError: If the file cannot be used, or holds no Gaussian.
     """
     read = read_gaussians(path, feature_dim)
+    if read.doubt:
+        log.warning("%s: %s", path, read.doubt)
     params = dict(read.params)
     n = len(params["means"])
     if n == 0:

@@ -50,6 +50,8 @@ class Stage:
     seconds: float
     """Of training."""
     skips: SkipCount
+    color: bool = True
+    """Off: trained for language alone."""
 
 
 @dataclass
@@ -96,7 +98,7 @@ class Stages:
             stage = f" of {name}" if name else ""
             where = f"step {module.next_step} of {module.settings.iterations}{stage}"
             raise StoppedError(stopped_by, where)
-        self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips)
+        self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips, color)
         return module.model
 
     def lift(self, name: str, geometry: SplatModel, scene: Scene) -> SplatModel:
