@@ -1,5 +1,6 @@
 """Picture files of a run: a folder per held-out view, a histogram and one sheet that shows them together."""
 
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import TypeVar
 from jaxtyping import UInt8
 from torch import Tensor
 
+from vlgs.files import write_atomically
 from vlgs.query import Prompts, Query
 from vlgs.report.answer import ViewModel
 from vlgs.report.draw import Painter, ViewPictures
@@ -108,4 +110,6 @@ def _save(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:
         Image,
     )  # pycolmap must not be imported before it; whoever needs pycolmap sees to that
 
-    Image.fromarray(picture.numpy()).save(path)
+    stream = io.BytesIO()
+    Image.fromarray(picture.numpy()).save(stream, format="png")
+    write_atomically(path, stream.getvalue(), durable=False)
