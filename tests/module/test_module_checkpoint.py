@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save
 
 from vlgs.files import write_atomically
-from vlgs.module.checkpoint import Checkpoint, forget_after, load_checkpoint, save_checkpoint
+from vlgs.module.checkpoint import Checkpoint, keep_from, load_checkpoint, save_checkpoint
 
 
 def example(step: int) -> Checkpoint:
@@ -66,7 +66,7 @@ def test_a_cut_file_gives_way_to_the_one_before(
     (said,) = caplog.messages
     assert "step_00000010" in said
     assert "step_00000005.safetensors is taken instead" in said
-    forget_after(tmp_path, 5)
+    keep_from(tmp_path, 5)
     assert [p.name for p in tmp_path.iterdir()] == ["step_00000005.safetensors"]
 
 

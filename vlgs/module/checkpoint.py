@@ -56,8 +56,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     path = folder / f"step_{checkpoint.step:08d}.safetensors"
     write_atomically(path, data)
     with suppress(OSError):
-        for old in _candidates(folder)[KEPT:]:
-            old.unlink()
+        keep_from(folder, checkpoint.step)
     return path
 
 
@@ -90,10 +89,11 @@ def checkpoint_bytes(folder: Path) -> int:
     return next((path.stat().st_size for path in _candidates(folder)), 0)
 
 
-def forget_after(folder: Path, step: int) -> None:
-    """Remove the checkpoints of later steps: where an earlier one was taken, they are damaged and must not count as kept."""
+def keep_from(folder: Path, step: int) -> None:
+    """Keep the checkpoint of a step and the one before; those of later steps, if an earlier one had to be taken, are damaged."""
+    kept = [path for path in _candidates(folder) if _step(path) <= step][:KEPT]
     for path in _candidates(folder):
-        if _step(path) > step:
+        if path not in kept:
             path.unlink()
 
 

@@ -19,7 +19,7 @@ from vlgs.module.callbacks import (
     ProgressLine,
     TrainingClock,
 )
-from vlgs.module.checkpoint import forget_after, load_checkpoint
+from vlgs.module.checkpoint import keep_from, load_checkpoint
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.state import restore
 from vlgs.module.stuck import StuckAlarm
@@ -67,7 +67,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     checkpoint = load_checkpoint(folder.checkpoint)
     if checkpoint is not None:
         restore(module, checkpoint)
-        forget_after(folder.checkpoint, checkpoint.step)
+        keep_from(folder.checkpoint, checkpoint.step)
         log.info("resuming %s at step %d", folder.path, module.next_step)
     steps = _Steps(module)
     if len(steps) == 0:
