@@ -250,7 +250,7 @@ def _digest(path: Path) -> str:
         data = json.dumps(metrics).encode()
     elif path.name == "log.csv":
         data = repr([row[:-1] for row in csv.reader(data.decode().splitlines())]).encode()
-    elif path.parent.name == "checkpoint":
+    elif path.suffix == ".safetensors":
         from safetensors.torch import load
 
         tensors = sorted(load(data).items())
