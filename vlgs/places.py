@@ -65,7 +65,7 @@ def without_places(content: Any, named: Mapping[str, str] | None = None) -> Any:
         content: What may hold paths: whole strings, values of overrides (``data.root=/a/b``), ``file://`` addresses.
         named: Folder -> what it is called, before the current folder and the home.
     """
-    known = {**(named or {}), os.getcwd(): ".", str(Path.home()): "~"}
+    known = {**(named or {}), os.getcwd(): ".", os.path.expanduser("~"): "~"}
 
     def short(path: str) -> str:
         path = os.path.normpath(path)
