@@ -1,27 +1,42 @@
 """Writing files so that a crash or a full disk never leaves half of one."""
 
+import fcntl
 import os
+import re
+import secrets
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
+
+_TEMPORARY = re.compile(r"\..+\.\d+(-[0-9a-f]{8})?\.tmp")
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replace a file by `data`, or leave it as it was.
+def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
+    """Replace a file by `data`, or leave it as it was; a reader sees the old file or the whole new one.
+
+    Args:
+        path: The file; its folder must exist.
+        data: Its content.
+        durable: Whether to wait until the disk has it, so that it survives a power cut too and not only a killed process.
 
     Raises:
         OSError: With the path and the cause; no temporary file stays behind.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
+    sweep(path.parent)
+    with _open_temporary(path) as file:
+        temporary = Path(file.name)
+        try:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
+            if durable:
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except OSError:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+    if not durable:
+        return
     descriptor = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -33,3 +48,39 @@ def write_changed(path: Path, data: bytes) -> None:
     """`write_atomically`, unless the file holds just that: a file that stays need not wait for the disk."""
     if not path.is_file() or path.read_bytes() != data:
         write_atomically(path, data)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what killed processes left half-written in a folder.
+
+    Who writes a temporary file holds a lock on it, which dies with its process. Process numbers would not do: two containers that
+    share a disk count their processes apart.
+    """
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if _TEMPORARY.fullmatch(entry.name):
+                _remove_if_dead(Path(entry.path))
+
+
+def sweep_below(folder: Path) -> None:
+    """`sweep` a folder and every folder in it."""
+    for inner, _, _ in os.walk(folder):
+        sweep(Path(inner))
+
+
+def _open_temporary(path: Path) -> BinaryIO:
+    """A new file beside `path`, locked."""
+    while True:
+        name = f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+        file = path.with_name(name).open("xb")
+        with suppress(OSError):  # on a disk without locks nobody can sweep either
+            fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file.fileno()).st_nlink:
+            return file
+        file.close()  # swept between the two calls
+
+
+def _remove_if_dead(path: Path) -> None:
+    with suppress(OSError), path.open("r+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path.unlink()

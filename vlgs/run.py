@@ -11,7 +11,7 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from vlgs.arguments import command_line, take_command_line
 from vlgs.config import (
@@ -24,6 +24,7 @@ from vlgs.config import (
     instantiate,
     run_id,
 )
+from vlgs.places import record, tidy_sweep, write_config
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 from vlgs.tables.multirun import note_run
 from vlgs.text import screen
@@ -35,6 +36,8 @@ log = logging.getLogger(__name__)
 def main(config: DictConfig) -> None:
     """One run; in a multirun Hydra calls this once per combination."""
     alone = HydraConfig.get().mode == RunMode.RUN and "HYDRA_FULL_ERROR" not in os.environ
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        tidy_sweep(Path(HydraConfig.get().sweep.dir))
     try:
         status = run(config)
     except (ValueError, OSError, FloatingPointError) as error:
@@ -77,8 +80,8 @@ def run(config: DictConfig) -> int:
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
         )
-    with folder.writing():
-        return _run_in(folder, config, scenes)
+    with folder.writing() as own:
+        return _run_in(own, config, scenes)
 
 
 def _scenes(config: DictConfig) -> dict[int | None, Any]:
@@ -95,7 +98,7 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
     from vlgs.module.stages import StoppedError, train_all
 
     text = _text_encoder(config, next(reversed(scenes.values())))
-    folder.config.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    write_config(folder.config, config)
     stages = _stages(folder, config, scenes)
     try:
         sharing, augment = instantiate(config.sharing), instantiate(config.augment)
@@ -154,7 +157,7 @@ def _stages(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]
 
     def make_options() -> FitOptions:
         meta = {
-            "config": OmegaConf.to_container(config, resolve=True),
+            "config": record(config),
             "fingerprint": " ".join(scene.fingerprint for scene in scenes.values()),
         }
         loggers = [instantiate(logger) for logger in config.logger.loggers]
@@ -185,6 +188,7 @@ def _report(
     model, scene = models[-1], next(reversed(scenes.values()))
     query, protocol = instantiate(config.query), instantiate(config.protocol)
     done, kept = stages.done.values(), stages.kept
+    folder.require_own()
     for stage in kept:
         cloud = point_cloud(stage.model, [view.camera for view in scene.train], stage.color)
         write_ply(stage.folder.ply, cloud.params, notes=cloud.notes)
@@ -208,7 +212,7 @@ def _report(
         "skips": all_skips(done).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         "ply_bytes": sum(stage.folder.ply.stat().st_size for stage in kept),
-        "checkpoint_bytes": sum(_checkpoint_bytes(stage.folder) for stage in kept),
+        "checkpoint_bytes": sum(stage.checkpoint_bytes for stage in kept),
         "seed": config.seed,
         "config_hash": folder.path.name,
         "recipe": identity(config).recipe,
@@ -221,12 +225,9 @@ def _report(
         "machine": machine(),
         **asdict(timing),
     }
+    folder.require_own()
     write_queries(folder.queries, evaluation)
     return write_metrics(folder.metrics, evaluation, extra)
-
-
-def _checkpoint_bytes(folder: RunFolder) -> int:
-    return max(file.stat().st_size for file in folder.checkpoint.glob("*.safetensors"))
 
 
 def _places(folder: RunFolder) -> dict[str, Path]:

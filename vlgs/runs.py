@@ -7,12 +7,14 @@
 
 import fcntl
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vlgs.files import sweep_below
 from vlgs.finished import read_finished
 
 STOPPED = 130
@@ -25,11 +27,35 @@ BUSY = 75
 """Exit status where another process is computing this very run."""
 
 
+def stop_signals() -> tuple[signal.Signals, ...]:
+    """Signals that ask a run to save and stop; a closed terminal's is left alone where it is ignored, as under nohup."""
+    hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)
+    return (signal.SIGINT, signal.SIGTERM, *hangup)
+
+
 @dataclass(frozen=True)
-class RunFolder:
-    """The folder of one run."""
+class Lock:
+    """A lock file that this process holds."""
 
     path: Path
+    descriptor: int
+
+    def holds(self) -> bool:
+        """Whether the file is still in its place: once it is deleted, another process can make and hold one of its own."""
+        try:
+            there = self.path.stat()
+        except FileNotFoundError:
+            return False
+        return os.path.samestat(there, os.fstat(self.descriptor))
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The folder of one run, or of one model of a run that trains several."""
+
+    path: Path
+    lock: Lock | None = None
+    """Of the run, where this process is writing it."""
 
     @property
     def config(self) -> Path:
@@ -66,6 +92,22 @@ class RunFolder:
         """Gaussians as other viewers draw them: after fusion."""
         return self.path / "point_cloud.ply"
 
+    def part(self, name: str) -> "RunFolder":
+        """The folder of one model of this run; an empty name is this folder."""
+        return replace(self, path=self.path / name)
+
+    def require_own(self) -> None:
+        """Do nothing if the folder is still the one that was opened for writing.
+
+        Raises:
+            FileNotFoundError: If somebody has deleted or moved it, or made it again.
+        """
+        if self.lock is not None and not self.lock.holds():
+            raise FileNotFoundError(
+                f"run: {self.lock.path.parent} must stay in its place while the run writes to it, got it deleted, moved or "
+                "replaced; the same command runs again, from the last checkpoint if there still is one"
+            )
+
     def finished(self) -> dict[str, Any] | None:
         """The results of a finished run.
 
@@ -75,14 +117,17 @@ class RunFolder:
         return read_finished(self.metrics) if self.metrics.is_file() else None
 
     @contextmanager
-    def writing(self) -> Iterator[None]:
+    def writing(self) -> Iterator["RunFolder"]:
         """Hold the folder: a second process that wants it is refused. The lock dies with its process.
+
+        What killed processes left half-written in it is removed.
 
         Raises:
             BlockingIOError: If another process holds it.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / ".lock").open("a+") as file:
+        path = self.path / ".lock"
+        with path.open("a+") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -94,4 +139,5 @@ class RunFolder:
             file.truncate(0)
             file.write(str(os.getpid()))
             file.flush()
-            yield
+            sweep_below(self.path)
+            yield replace(self, lock=Lock(path, file.fileno()))

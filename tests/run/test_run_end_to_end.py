@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import TINY, composed
 
+from vlgs.config import CONF
 from vlgs.report.results import METRICS
 from vlgs.run import run
 from vlgs.runs import UNSCORED, RunFolder
@@ -253,3 +254,9 @@ def test_a_multirun_makes_one_run_per_combination(tmp_path: Path):
     assert len(folders) == 2
     assert all(folder.finished() for folder in folders)
     assert not list(empty.iterdir()), "a sweep must leave nothing where it was started"
+    assert (tmp_path / "multirun" / "multirun.yaml").is_file()
+    for path in tmp_path.rglob("*"):
+        content = path.read_bytes() if path.is_file() else b""
+        for place in (tmp_path, CONF.parent, Path.home()):
+            assert f"{place}/".encode() not in content, path
+            assert f"{tmp_path}\n".encode() not in content, path

@@ -305,6 +305,25 @@ def test_the_report_has_its_pictures(table: Table, tmp_path: Path):
     assert "<b>51.0</b>" in text
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"mine\n1\n",
+        b"step,psnr\n\n\n10,20.0\n\xff,\xfe\n1,2,3,4,5\n20,2\0\n20",
+        bytes(range(256)),
+    ],
+)
+def test_a_damaged_log_costs_its_own_points_only(table: Table, tmp_path: Path, content: bytes):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    for log in (tmp_path / "runs").glob("*/log.csv"):
+        log.write_bytes(content)
+    (tmp_path / "synthetic").mkdir(exist_ok=True)
+    filled = filled_of(table, tmp_path)
+    write_report(tmp_path / "synthetic", [filled], tidy(to_lines(read_metrics(tmp_path))), tmp_path)
+    assert (tmp_path / "synthetic" / "plots" / "curves.png").is_file()
+
+
 def test_all_formats_say_where_the_numbers_come_from(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")

@@ -35,7 +35,7 @@ from vlgs.ablate.launch import launch
 from vlgs.ablate.plan import PlannedRun, find, plan
 from vlgs.ablate.progress import Count, duration, shown
 from vlgs.config import literal_override, override_value
-from vlgs.runs import STOPPED
+from vlgs.runs import STOPPED, stop_signals
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.frame import read_metrics
 from vlgs.tables.registry import Table, choose, load_tables
@@ -240,7 +240,7 @@ def _missing(
 
 @contextmanager
 def stop_file(path: Path) -> Iterator[threading.Event]:
-    """Turn Ctrl-C and SIGTERM into a file that all jobs look for, so that they save wherever they run.
+    """Turn Ctrl-C, SIGTERM and a closed terminal into a file that all jobs look for, so that they save wherever they run.
 
     A second signal interrupts at once.
     """
@@ -255,7 +255,7 @@ def stop_file(path: Path) -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield stopping
         return
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, stop) for number in stop_signals()}
     try:
         yield stopping
     finally:

@@ -15,6 +15,7 @@ from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.state import restore
+from vlgs.places import found_again, record, write_config
 from vlgs.runs import RunFolder
 from vlgs.types import RasterConfig, Scene
 
@@ -61,14 +62,14 @@ def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
     scene = instantiate(config.data)
     module = build(config, scene)
     meta = {
-        "config": OmegaConf.to_container(config, resolve=True),
+        "config": record(config),
         "fingerprint": scene.fingerprint,
     }
     folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint))
     folder.path.mkdir(parents=True, exist_ok=True)
-    with folder.writing():
-        folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
-        if fit(module, folder, FitOptions(meta)) is not None:
+    with folder.writing() as own:
+        write_config(own.config, config)
+        if fit(module, own, FitOptions(meta)) is not None:
             raise KeyboardInterrupt
     return Trained(config, scene, module)
 
@@ -93,8 +94,7 @@ def load_run(path: Path) -> Trained:
     checkpoint = load_checkpoint(folder.checkpoint) if folder.config.is_file() else None
     if checkpoint is None:
         raise ValueError(f"bench: {path} must be a run folder with a checkpoint, got none")
-    config = OmegaConf.load(folder.config)
-    assert isinstance(config, DictConfig)
+    config = found_again(path.resolve())
     check_targets(config)
     scene: Any = instantiate(config.data)
     if scene.fingerprint != checkpoint.meta.get("fingerprint"):

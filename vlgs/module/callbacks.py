@@ -1,20 +1,24 @@
 """What happens around an iteration: densification, checkpoints, the progress bar, log.csv, a graceful stop."""
 
-import csv
 import math
+import os
 import signal
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import lightning as L
 
+from vlgs.files import write_atomically
 from vlgs.gaussians import densify, reset_opacity
 from vlgs.module.checkpoint import save_checkpoint
+from vlgs.module.curves import COLUMNS, csv_lines, read_rows
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.state import capture
+from vlgs.runs import RunFolder, stop_signals
 
 
 class Densification(L.Callback):
@@ -53,13 +57,11 @@ class Densification(L.Callback):
             reset_opacity(module.model.splats, module.optimizer, config)
 
 
-class Checkpoints(L.Callback):
-    """Save every so many iterations, at the end and before an early stop."""
+class OwnFolder(L.Callback):
+    """End a run whose folder was deleted or replaced, before anything more is written."""
 
-    def __init__(self, folder: Path, every: int, meta: dict[str, Any]) -> None:
+    def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
-        self.every = every
-        self.meta = meta
 
     def on_train_batch_end(
         self,
@@ -69,7 +71,32 @@ class Checkpoints(L.Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Save when it is time; the last iteration is saved by `on_train_end`."""
+        """Look."""
+        self.folder.require_own()
+
+
+class Checkpoints(L.Callback):
+    """Save every so many iterations, at the end and before an early stop; no step twice."""
+
+    def __init__(self, folder: Path, every: int, meta: dict[str, Any]) -> None:
+        self.folder = folder
+        self.every = every
+        self.meta = meta
+        self.saved: int | None = None
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """What is resumed from is saved already."""
+        self.saved = _own(pl_module).next_step
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Save when it is time."""
         module = _own(pl_module)
         if self.every and module.next_step % self.every == 0:
             self._save(module)
@@ -79,7 +106,9 @@ class Checkpoints(L.Callback):
         self._save(_own(pl_module))
 
     def _save(self, module: VLGSModule) -> None:
-        save_checkpoint(self.folder, capture(module, self.meta))
+        if module.next_step != self.saved:
+            save_checkpoint(self.folder, capture(module, self.meta))
+            self.saved = module.next_step
 
 
 class TrainingClock(L.Callback):
@@ -106,23 +135,16 @@ class TrainingClock(L.Callback):
 class CurveLog(L.Callback):
     """Append loss, PSNR and the number of Gaussians to log.csv and to the chosen Lightning loggers."""
 
-    COLUMNS = ("step", "loss", "psnr", "n_gaussians", "blend_weight", "seconds")
-
     def __init__(self, path: Path, every: int) -> None:
         self.path = path
         self.every = every
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Keep the rows up to the step that is resumed from; later ones will come again."""
-        module = _own(pl_module)
-        rows: list[list[str]] = []
-        if self.path.is_file() and module.next_step > 0:
-            with self.path.open(newline="") as file:
-                rows = [
-                    row for row in list(csv.reader(file))[1:] if int(row[0]) <= module.next_step
-                ]
-        with self.path.open("w", newline="") as file:
-            csv.writer(file).writerows([list(self.COLUMNS), *rows])
+        step, rows = _own(pl_module).next_step, []
+        if self.path.is_file() and step > 0:
+            rows = [row for row in read_rows(self.path) if int(row[0]) <= step]
+        write_atomically(self.path, csv_lines([COLUMNS, *rows]).encode())
 
     def on_train_batch_end(
         self,
@@ -144,10 +166,10 @@ class CurveLog(L.Callback):
             "blend_weight": report.blend_weight,
             "seconds": module.train_seconds,
         }
+        cells = [module.next_step, *(f"{value:.6g}" for value in row.values())]
         with self.path.open("a", newline="") as file:
-            csv.writer(file).writerow(
-                [module.next_step, *(f"{value:.6g}" for value in row.values())]
-            )
+            deleted = file.tell() == 0  # by somebody, in mid-run: it goes on from here
+            file.write(csv_lines([COLUMNS, cells] if deleted else [cells]))
         for logger in trainer.loggers:
             logger.log_metrics({k: float(v) for k, v in row.items()}, step=module.next_step)
 
@@ -188,7 +210,8 @@ class ProgressLine(L.Callback):
             psnr=0.0,
             count=module.model.count,
         )
-        self.bar.start()
+        with suppress(OSError):
+            self.bar.start()
 
     def on_train_batch_end(
         self,
@@ -215,23 +238,26 @@ class ProgressLine(L.Callback):
             psnr=psnr_of(self.mse),
             count=module.model.count,
         )
-        self.bar.refresh()
+        with suppress(OSError):  # a closed terminal must not end a training
+            self.bar.refresh()
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Leave the last state on the screen."""
-        self.bar.stop()
+        with suppress(OSError):
+            self.bar.stop()
 
     def on_exception(
         self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
     ) -> None:
         """Give the terminal back."""
-        self.bar.stop()
+        with suppress(OSError):
+            self.bar.stop()
 
 
 class GracefulStop(L.Callback):
-    """Ctrl-C and SIGTERM end training after the current iteration, so that what is saved is a whole step.
+    """Ctrl-C, SIGTERM and a closed terminal end training after the current iteration, so that what is saved is a whole step.
 
-    A second signal interrupts at once.
+    A second signal interrupts at once, but for a second hangup: shell and kernel may both send one.
     """
 
     def __init__(self) -> None:
@@ -244,11 +270,14 @@ class GracefulStop(L.Callback):
         def stop(number: int, frame: FrameType | None) -> None:
             self.stopped_by = signal.Signals(number).name
             trainer.should_stop = True
-            signal.signal(number, signal.default_int_handler)
+            again = signal.SIG_IGN if number == signal.SIGHUP else signal.default_int_handler
+            signal.signal(number, again)
+            _leave_closed_terminal(terminals)
 
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in (signal.SIGINT, signal.SIGTERM):
+        terminals = [descriptor for descriptor in (1, 2) if os.isatty(descriptor)]
+        for number in stop_signals():
             self.previous[number] = signal.signal(number, stop)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -265,6 +294,15 @@ class GracefulStop(L.Callback):
         for number, handler in self.previous.items():
             signal.signal(number, handler)
         self.previous.clear()
+
+
+def _leave_closed_terminal(terminals: list[int]) -> None:
+    """Let what would be printed on a terminal that is no more go nowhere; it must not end what is being saved."""
+    for descriptor in terminals:
+        if not os.isatty(descriptor):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, descriptor)
+            os.close(nowhere)
 
 
 def psnr_of(mse: float) -> float:

@@ -1,25 +1,32 @@
-"""Checkpoints: one safetensors file with a JSON header, written so that a crash never costs the one before.
+"""Checkpoints: one safetensors file each, which is whole and verified, or is not taken.
 
-A file is complete or it does not exist: it is written under a temporary name, flushed to disk and renamed. `latest.json`
-names the newest one and its digest; when it is missing or does not fit, the newest file that reads well is taken.
-Nothing is ever unpickled.
+A file is written under a temporary name and renamed, and the digest of all that it holds stands in its header, so that one rename
+makes a checkpoint complete. The two newest are kept: where the newer one is damaged, the older one is taken. Nothing is ever
+unpickled.
 """
 
 import hashlib
 import json
 import logging
+import re
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from vlgs.files import write_atomically
 
 log = logging.getLogger(__name__)
 
-FORMAT = "vlgs-checkpoint-1"
+FORMAT = "vlgs-checkpoint-2"
+FIRST_FORMAT = "vlgs-checkpoint-1"
+"""Its digest, of the whole file, stands in ``latest.json`` beside it."""
+KEPT = 2
+_NAME = re.compile(r"step_(\d+)\.safetensors")
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,7 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint and forget the older ones.
+    """Write a checkpoint; of those before it the newest stays.
 
     Raises:
         OSError: If the disk is full or read-only; the previous checkpoint is then untouched.
@@ -41,62 +48,109 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     from safetensors.torch import save
 
     folder.mkdir(parents=True, exist_ok=True)
-    header = {"format": FORMAT, "step": str(checkpoint.step), "meta": json.dumps(checkpoint.meta)}
-    data = save({k: v.detach().contiguous() for k, v in checkpoint.tensors.items()}, header)
+    tensors = {key: value.detach().contiguous() for key, value in checkpoint.tensors.items()}
+    step, meta = str(checkpoint.step), json.dumps(checkpoint.meta)
+    header = {"format": FORMAT, "step": step, "meta": meta, "digest": _digest(step, meta, tensors)}
+    # One entry, because safetensors writes several in random order: equal checkpoints are equal bytes.
+    data = save(tensors, {"vlgs": json.dumps(header)})
     path = folder / f"step_{checkpoint.step:08d}.safetensors"
     write_atomically(path, data)
-    latest = {"file": path.name, "step": checkpoint.step, "blake2b": _digest(data)}
-    write_atomically(folder / "latest.json", json.dumps(latest, indent=2).encode())
-    for old in folder.glob("step_*.safetensors"):
-        if old != path:
-            with suppress(OSError):
-                old.unlink()
+    with suppress(OSError):
+        keep_from(folder, checkpoint.step)
     return path
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that reads well; None where there is none.
+    """The newest checkpoint that is sound; None where there is none at all.
 
     Raises:
-        ValueError: If checkpoints are there but none of them is readable.
+        ValueError: If checkpoints are there but none of them is sound.
     """
-    candidates = sorted(folder.glob("step_*.safetensors"), reverse=True)
-    if not candidates:
-        return None
-    digests = _latest_digest(folder)
-    problems = []
+    problems: list[str] = []
+    candidates = _candidates(folder)
     for path in candidates:
         try:
-            return _read(path, digests.get(path.name))
-        except ValueError as error:
-            log.warning("checkpoint: %s; trying the one before", error)
-            problems.append(str(error))
-    raise ValueError(f"checkpoint: {folder} must hold a readable file, got {'; '.join(problems)}")
+            checkpoint = _read(path)
+        except (ValueError, OSError) as error:
+            problems.append(f"{path.name} {error}")
+            continue
+        if problems:
+            log.warning("checkpoint: %s; %s is taken instead", "; ".join(problems), path.name)
+        return checkpoint
+    if not candidates:
+        return None
+    raise ValueError(
+        f"checkpoint: {folder} must hold a sound file, got {'; '.join(problems)}; without the folder the run starts anew"
+    )
 
 
-def _read(path: Path, digest: str | None) -> Checkpoint:
+def checkpoint_bytes(folder: Path) -> int:
+    """Size of the newest checkpoint; 0 if somebody has removed it."""
+    return next((path.stat().st_size for path in _candidates(folder)), 0)
+
+
+def keep_from(folder: Path, step: int) -> None:
+    """Keep the checkpoint of a step and the one before; those of later steps, if an earlier one had to be taken, are damaged."""
+    kept = [path for path in _candidates(folder) if _step(path) <= step][:KEPT]
+    for path in _candidates(folder):
+        if path not in kept:
+            path.unlink()
+
+
+def _candidates(folder: Path) -> list[Path]:
+    """Newest first."""
+    found = [path for path in folder.glob("step_*.safetensors") if _NAME.fullmatch(path.name)]
+    return sorted(found, key=_step, reverse=True)
+
+
+def _step(path: Path) -> int:
+    match = _NAME.fullmatch(path.name)
+    assert match  # `_candidates`
+    return int(match[1])
+
+
+def _read(path: Path) -> Checkpoint:
+    """Raises ValueError, with what follows the file's name in a sentence."""
     from safetensors import SafetensorError, safe_open
 
-    if digest is not None and _digest(path.read_bytes()) != digest:
-        raise ValueError(f"{path.name} does not match its digest")
     try:
         with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
+            outer = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no __iter__)
     except SafetensorError as error:
-        raise ValueError(f"{path.name} is not a safetensors file: {error}") from error
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{path.name} must have format {FORMAT}, got {header.get('format')}")
-    return Checkpoint(int(header["step"]), tensors, json.loads(header["meta"]))
-
-
-def _latest_digest(folder: Path) -> dict[str, str]:
+        raise ValueError(f"is not a safetensors file ({error})") from error
     try:
-        latest = json.loads((folder / "latest.json").read_text())
-        return {str(latest["file"]): str(latest["blake2b"])}
+        header = json.loads(outer["vlgs"]) if "vlgs" in outer else outer
+        written, step, meta = header["format"], header["step"], header["meta"]
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError("has no header of format, step and meta") from error
+    if written == FORMAT:
+        sound = header.get("digest") == _digest(step, meta, tensors)
+    elif written == FIRST_FORMAT:
+        sound = (
+            _first_digest(path) == hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+        )
+    else:
+        raise ValueError(f"must have format {FORMAT}, got {written}")
+    if not sound:
+        raise ValueError("does not match its digest")
+    return Checkpoint(int(step), tensors, json.loads(meta))
+
+
+def _digest(step: str, meta: str, tensors: Mapping[str, Tensor]) -> str:
+    """Hash of everything that a checkpoint holds."""
+    layout = {key: [str(value.dtype), list(value.shape)] for key, value in tensors.items()}
+    digest = hashlib.blake2b(
+        json.dumps([step, meta, layout], sort_keys=True).encode(), digest_size=16
+    )
+    for key in sorted(tensors):
+        digest.update(tensors[key].reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _first_digest(path: Path) -> str | None:
+    try:
+        latest = json.loads((path.parent / "latest.json").read_text())
+        return str(latest["blake2b"]) if latest["file"] == path.name else None
     except (OSError, ValueError, KeyError, TypeError):
-        return {}
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
+        return None

@@ -15,10 +15,11 @@ from vlgs.module.callbacks import (
     CurveLog,
     Densification,
     GracefulStop,
+    OwnFolder,
     ProgressLine,
     TrainingClock,
 )
-from vlgs.module.checkpoint import load_checkpoint
+from vlgs.module.checkpoint import keep_from, load_checkpoint
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.state import restore
 from vlgs.module.stuck import StuckAlarm
@@ -60,11 +61,13 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
 
     Raises:
         FloatingPointError: If a loss or gradient is not finite; the checkpoint before it stays.
-        OSError: If a checkpoint cannot be written; the one before stays.
+        OSError: If a checkpoint cannot be written, or the folder is deleted meanwhile; the checkpoint before stays.
     """
+    folder.require_own()
     checkpoint = load_checkpoint(folder.checkpoint)
     if checkpoint is not None:
         restore(module, checkpoint)
+        keep_from(folder.checkpoint, checkpoint.step)
         log.info("resuming %s at step %d", folder.path, module.next_step)
     steps = _Steps(module)
     if len(steps) == 0:
@@ -72,6 +75,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     folder.path.mkdir(parents=True, exist_ok=True)
     stop = GracefulStop()
     callbacks: list[L.Callback] = [
+        OwnFolder(folder),  # before whatever writes
         StuckAlarm(module.settings.log_every),
         Densification(),
         TrainingClock(),  # ends an iteration after its densification

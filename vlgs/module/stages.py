@@ -14,10 +14,11 @@ import torch
 from vlgs.gaussians import Sharing
 from vlgs.module.augment import NoAugment, Offline
 from vlgs.module.build import Parts, build_module
-from vlgs.module.checkpoint import save_checkpoint
+from vlgs.module.checkpoint import checkpoint_bytes, save_checkpoint
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.joint import join_levels
 from vlgs.module.lift import lift_features
+from vlgs.module.lightning import VLGSModule
 from vlgs.module.separate import for_language, unite, without_language
 from vlgs.module.skips import SkipCount
 from vlgs.module.state import capture
@@ -50,6 +51,7 @@ class Stage:
     seconds: float
     """Of training."""
     skips: SkipCount
+    checkpoint_bytes: int
     color: bool = True
     """Off: trained for language alone."""
 
@@ -88,7 +90,7 @@ class Stages:
         Raises:
             StoppedError: If it was asked to stop.
         """
-        folder = RunFolder(self.folder.path / name)
+        folder = self.folder.part(name)
         if name:
             log.info("model %s of this run, in %s", name, folder.path)
         parts = self.make_parts()
@@ -98,8 +100,7 @@ class Stages:
             stage = f" of {name}" if name else ""
             where = f"step {module.next_step} of {module.settings.iterations}{stage}"
             raise StoppedError(stopped_by, where)
-        self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips, color)
-        return module.model
+        return self._finish(name, folder, module, color)
 
     def lift(self, name: str, geometry: SplatModel, scene: Scene) -> SplatModel:
         """Lift the language of a scene onto finished Gaussians (`lift_features`); the folder is as that of a trained model.
@@ -109,7 +110,7 @@ class Stages:
             geometry: Trained on colour.
             scene: Whose masks count.
         """
-        folder, started = RunFolder(self.folder.path / name), time.perf_counter()
+        folder, started = self.folder.part(name), time.perf_counter()
         parts = self.make_parts()
         start = {key: value.detach() for key, value in geometry.splats.items()}
         start["features"] = torch.zeros(geometry.count, parts.codec.dim * scene.mask_levels)
@@ -118,8 +119,15 @@ class Stages:
         lift_features(module)
         module.next_step = module.settings.iterations
         module.train_seconds = time.perf_counter() - started
+        folder.require_own()
         save_checkpoint(folder.checkpoint, capture(module, self.make_options().meta))
-        self.done[name] = Stage(folder, module.model, module.train_seconds, module.skips)
+        return self._finish(name, folder, module)
+
+    def _finish(
+        self, name: str, folder: RunFolder, module: VLGSModule, color: bool = True
+    ) -> SplatModel:
+        size, seconds = checkpoint_bytes(folder.checkpoint), module.train_seconds
+        self.done[name] = Stage(folder, module.model, seconds, module.skips, size, color)
         return module.model
 
 

@@ -1,5 +1,6 @@
 """The sheet a person would show: views as rows, what the model makes of them as columns. Matplotlib, without a display."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vlgs.files import write_atomically
 from vlgs.report import colors
 from vlgs.report.draw import ViewPictures
 from vlgs.text import plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.typing import RcKeyType
 
 STYLE: "dict[RcKeyType, Any]" = {
@@ -58,7 +61,7 @@ def write_histogram(path: Path, density: Float[Tensor, " bins"]) -> None:
     with rc_context(STYLE):
         figure = Figure(figsize=(4.0, 2.4))
         _draw_histogram(figure.add_axes((0.03, 0.2, 0.94, 0.76)), density)
-        figure.savefig(path, dpi=DPI)
+        _save(figure, path)
 
 
 def write_overview(
@@ -75,7 +78,13 @@ def write_overview(
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        _Sheet(names, rows, density).figure.savefig(path, dpi=DPI)
+        _save(_Sheet(names, rows, density).figure, path)
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    stream = io.BytesIO()
+    figure.savefig(stream, format=path.suffix[1:], dpi=DPI)
+    write_atomically(path, stream.getvalue(), durable=False)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Picture files of a run: a folder per held-out view, a histogram and one sheet that shows them together."""
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TypeVar
 from jaxtyping import UInt8
 from torch import Tensor
 
+from vlgs.files import write_atomically
 from vlgs.names import file_names
 from vlgs.query import Prompts, Query
 from vlgs.report.answer import ViewModel
@@ -116,4 +118,6 @@ def _save(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:
         Image,
     )  # pycolmap must not be imported before it; whoever needs pycolmap sees to that
 
-    Image.fromarray(picture.numpy()).save(path)
+    stream = io.BytesIO()
+    Image.fromarray(picture.numpy()).save(stream, format="png")
+    write_atomically(path, stream.getvalue(), durable=False)

@@ -128,8 +128,20 @@ def _curves(runs: Sequence[Line], results: Path) -> dict[str, list[pd.DataFrame]
     for run in runs:
         path = results / "runs" / run.config_hash / "log.csv"
         if path.is_file():
-            curves.setdefault(run.scene, []).append(pd.read_csv(path))
+            curves.setdefault(run.scene, []).append(_curve(path))
     return curves
+
+
+def _curve(path: Path) -> pd.DataFrame:
+    """What can be read of a log.csv; no number of a table depends on it."""
+    columns = ["step", "psnr"]
+    try:
+        rows = pd.read_csv(
+            path, usecols=columns, encoding_errors="replace", on_bad_lines="skip", dtype=str
+        )
+    except ValueError:  # empty, or without these columns
+        return pd.DataFrame(columns=columns, dtype=float)
+    return rows.apply(pd.to_numeric, errors="coerce").dropna()
 
 
 def _histograms(runs: Sequence[Line], results: Path) -> list[dict[str, list[float]]]:
