@@ -1,7 +1,5 @@
 """Image files -> uint8 RGB in the geometry of their COLMAP camera."""
 
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,19 +10,9 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from vlgs.data.faults import Fault, SceneError
+from vlgs.data.untrusted.pictures import picture
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-
-UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
-"""What Pillow raises on a damaged file, besides what it is documented to raise."""
 
 _ORIENTATION = 0x0112
 
@@ -56,13 +44,10 @@ def open_photograph(path: Path, camera_size: tuple[int, int]) -> Photograph:
     Raises:
         SceneError: If the file cannot be read or has another shape than the camera.
     """
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-            orientation = image.getexif().get(_ORIENTATION, 1)
-            mode = image.mode
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from error
+    with picture(path) as image:
+        width, height = image.size
+        orientation = image.getexif().get(_ORIENTATION, 1)
+        mode = image.mode
     if mode in ("I", "F"):
         raise SceneError(Fault(str(path), f"pixels must be 8 or 16 bit integers, got mode {mode}"))
     tagged = orientation not in (0, 1)
@@ -81,11 +66,8 @@ def read_photograph(photograph: Photograph) -> UInt8[Tensor, "h w 3"]:
     Raises:
         SceneError: If the file is truncated or damaged.
     """
-    try:
-        with Image.open(photograph.path) as image:
-            rgb = _to_rgb(ImageOps.exif_transpose(image) if photograph.turned else image)
-    except UNREADABLE as error:
-        raise _unreadable(photograph.path, error) from error
+    with picture(photograph.path, decode=True) as image:
+        rgb = _to_rgb(ImageOps.exif_transpose(image) if photograph.turned else image)
     return torch.from_numpy(np.array(rgb))
 
 
@@ -119,9 +101,3 @@ def _to_rgb(image: Image.Image) -> Image.Image:
             "RGB"
         )
     return image.convert("RGB")
-
-
-def _unreadable(path: Path, error: BaseException) -> SceneError:
-    size = path.stat().st_size if path.is_file() else 0
-    what = f"content must be a whole image, got {size} bytes that do not decode ({error})"
-    return SceneError(Fault(str(path), what, "copy the file again"))
