@@ -69,22 +69,22 @@ def write_corpus(folder: Path) -> list[Honest]:
         ),
         "weights": (_weights, lambda f: convert(f / "w.safetensors", f / "out.pth"), True),
         "words": (_words, lambda f: read_words(f / "words.txt"), True),
-        "maps": (_feature_map, _read_feature_map, True),
-        "settings": (_settings, _read_settings, True),
+        "maps": (_feature_map, read_feature_map, True),
+        "settings": (_settings, _read_settings, False),
         "processor": (_processor, _read_processor, True),
         "codec_cache": (_codec_cache, _fit_from_cache, True),
     }
     found = []
     for name, (write, read, names_itself) in units.items():
         (folder / name).mkdir(parents=True)
-        _in_a_child(lambda write=write, name=name: write(folder / name))
+        in_a_child(lambda write=write, name=name: write(folder / name))
         for path in sorted((folder / name).rglob("*")):
             if path.is_file():
                 found.append(Honest(path.relative_to(folder), name, read, names_itself))
     return found
 
 
-def _in_a_child(work: Callable[[], None]) -> None:
+def in_a_child(work: Callable[[], object]) -> None:
     """The parent of all attacks must not have computed with torch: its threads do not live on in a fork."""
     child = os.fork()
     if child == 0:
@@ -283,7 +283,7 @@ def _feature_map(root: Path) -> None:
     np.save(root / "a.npy", np.random.default_rng(0).normal(size=(4, 5, 6)).astype(np.float32))
 
 
-def _read_feature_map(root: Path) -> None:
+def read_feature_map(root: Path) -> None:
     from vlgs.features.masks import Mask
 
     maps = DenseMaps(str(root), pattern="{stem}.npy")

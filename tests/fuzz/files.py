@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from tests.fuzz._corpus import Honest, write_corpus
 from tests.fuzz.judge import Attack
@@ -45,6 +46,7 @@ _DTYPES = (b"<f8", b">f4", b"|O8", b"<c8", b"<U9", b"<i4", b"|V4", b"<f2", b"|b1
 def attacks(folder: Path, seed: int, count: int) -> Iterator[Attack]:
     """Mutated files, the formats in turn."""
     import_pycolmap()  # once, and not in every child
+    Image.init()
     corpus = write_corpus(folder / "corpus")
     for number in range(count):
         rng = np.random.default_rng([seed, number])

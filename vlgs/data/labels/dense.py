@@ -5,6 +5,7 @@
 Pixels of a class that is ignored, and pixels with id 255, take no part in any score. `kind` is optional.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,8 +97,8 @@ def open_dense(folder: Path) -> tuple[DenseFolder | None, tuple[Fault, ...]]:
 def _class_faults(file: str, listed: Mapping[str, dict]) -> Iterator[Fault]:
     names = []
     for key, entry in listed.items():
-        if not key.isascii() or not key.isdecimal() or int(key) >= IGNORE_ID:
-            yield Fault(file, f"class id must be 0 to {IGNORE_ID - 1}, got {key!r}")
+        if not re.fullmatch("[0-9]{1,9}", key) or int(key) >= IGNORE_ID:
+            yield Fault(file, f"class id must be 0 to {IGNORE_ID - 1}, got {key[:40]!r}")
         name, kind, ignored = (
             entry.get("name"),
             entry.get("kind", "other"),
