@@ -19,6 +19,9 @@ from vlgs.vocabulary import read_words
 Read = Callable[[Path, Path], object]
 """Given the file and the folder of all that is read with it."""
 
+Bomb = tuple[str, str, str, Read, make.Write, bool]
+"""Name, unit of the corpus, file in it, what reads it, what writes it, whether it must be refused."""
+
 
 def _scene(file: Path, folder: Path) -> None:
     labels = folder / "segmentations"
@@ -113,7 +116,7 @@ IMAGES: tuple[tuple[str, make.Write], ...] = (
     ("a pipe", make.pipe),
 )  # fmt: skip
 
-BOMBS: tuple[tuple[str, str, str, Read, make.Write, bool], ...] = (
+BOMBS: tuple[Bomb, ...] = (
     *((f"PLY: {name}", "ply", "a.ply", _to_ply, write, True) for name, write in PLY),
     *(
         (f"PLY of points: {name}", "nerfstudio", "sparse_pc.ply", _scene, write, True)
@@ -201,15 +204,18 @@ def attacks(folder: Path, seed: int, count: int) -> Iterator[Attack]:
     import_pycolmap()  # once, and not in every child
     Image.init()
     write_corpus(folder / "corpus")
-    for name, unit, file, read, write, must_refuse in BOMBS:
-        there = folder / "attack" / unit
+    for bomb in BOMBS:
+        yield attack(folder, bomb)
 
-        def call(read: Read = read, path: Path = there / file, there: Path = there) -> None:
-            read(path, there)
 
-        shutil.rmtree(folder / "attack", ignore_errors=True)
-        shutil.copytree(folder / "corpus" / unit, there)
-        (there / "out").mkdir()
-        (there / file).unlink(missing_ok=True)
-        in_a_child(lambda write=write, path=there / file: write(path))
-        yield Attack(name, call, must_say=Path(file).name, must_refuse=must_refuse)
+def attack(folder: Path, bomb: Bomb) -> Attack:
+    """One bomb, laid among honest files."""
+    name, unit, file, read, write, must_refuse = bomb
+    there = folder / "attack" / unit
+    path = there / file
+    shutil.rmtree(folder / "attack", ignore_errors=True)
+    shutil.copytree(folder / "corpus" / unit, there)
+    (there / "out").mkdir()
+    path.unlink(missing_ok=True)
+    in_a_child(lambda: write(path))
+    return Attack(name, lambda: read(path, there), must_say=path.name, must_refuse=must_refuse)

@@ -30,9 +30,9 @@ _UNREADABLE = (
     struct.error,
     zlib.error,
     Image.DecompressionBombError,
-    Image.DecompressionBombWarning,
+    UserWarning,
 )
-"""What Pillow raises on a damaged file, besides what it is documented to raise."""
+"""What Pillow raises on a damaged file, besides what it is documented to raise; the last where warnings are errors."""
 
 _BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16L": 2, "I;16B": 2}
 """Bytes that Pillow takes for a pixel, where it is not four."""
