@@ -263,9 +263,7 @@ def crosses_itself(polygon: Float64[np.ndarray, "p 2"]) -> bool:
     # Side of edge i on which corner j lies; 0 for its own two.
     side = np.sign(edge[:, None, 0] * to[..., 1] - edge[:, None, 1] * to[..., 0])
     side[np.arange(len(edge)), np.arange(1, len(edge) + 1) % len(edge)] = 0
-    apart = (
-        side * np.roll(side, -1, axis=1) < 0
-    )  # the line of edge i runs between the ends of edge j
+    apart = side * np.roll(side, -1, axis=1) < 0  # edge j has its ends on both sides of edge i
     return bool((apart & apart.T).any())
 
 
