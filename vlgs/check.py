@@ -3,7 +3,7 @@
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import hydra
@@ -94,20 +94,18 @@ def view_faults(view: View) -> Iterator[Fault]:
     size = (view.camera.height, view.camera.width)
     for what, read in _readers(view):
         try:
-            maps = read()
+            for pixels in read():  # one at a time: there may be thousands of labelled categories
+                got = tuple(pixels.shape[:2])
+                if got != size:
+                    expected = f"{size} (height, width) as its camera"
+                    yield Fault(view.name, f"{what} must be {expected}, got {got}")
+                if what == "mask map" and not (pixels >= 0).any():
+                    yield warning(view.name, "mask map should reach a pixel, got -1 everywhere")
+                if what == "dense labels" and (pixels == IGNORE_ID).all():
+                    expected = "dense labels should name a class"
+                    yield warning(view.name, f"{expected}, got ignored pixels only")
         except SceneError as error:
             yield error.fault
-            continue
-        for pixels in maps:
-            if tuple(pixels.shape[:2]) != size:
-                got = tuple(pixels.shape[:2])
-                yield Fault(
-                    view.name, f"{what} must be {size} (height, width) as its camera, got {got}"
-                )
-        if what == "mask map" and not (maps[0] >= 0).any():
-            yield warning(view.name, "mask map should reach a pixel, got -1 everywhere")
-        if what == "dense labels" and (maps[0] == IGNORE_ID).all():
-            yield warning(view.name, "dense labels should name a class, got ignored pixels only")
 
 
 def summarize(scene: Scene) -> Iterator[str]:
@@ -173,7 +171,7 @@ def _views(scene: Scene) -> list[View]:
     return list({view.name: view for view in (*scene.train, *scene.test)}.values())
 
 
-def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]:
+def _readers(view: View) -> Iterator[tuple[str, Callable[[], Iterable[Tensor]]]]:
     """Name and pixels of everything that a view can read."""
     image, masks, valid = view.read_image, view.read_masks, view.read_valid
     dense, objects = view.read_dense_labels, view.read_object_labels
@@ -185,7 +183,7 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]
     if dense is not None:
         yield "dense labels", lambda: [dense().ids]
     if objects is not None:
-        yield "object labels", lambda: list(objects().masks.values())
+        yield "object labels", lambda: objects().masks.values()
 
 
 if __name__ == "__main__":

@@ -3,11 +3,13 @@
 import argparse
 import io
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from vlgs.data.untrusted.text import read_text
 from vlgs.files import write_atomically
 from vlgs.query.relevancy import CANONICAL_NEGATIVES
 from vlgs.query.text import CLIP_MODEL, ClipText, TextEncoder
@@ -53,12 +55,9 @@ def read_words(path: Path) -> list[str]:
         ValueError: If it is no UTF-8 text, has no words or one of them twice.
         OSError: If it cannot be read.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: content must be UTF-8 text, got {error}") from error
+    lines = read_text(path).splitlines()
     words = [word for line in lines if (word := line.partition("#")[0].strip())]
-    twice = sorted({word for word in words if words.count(word) > 1})
+    twice = sorted(word for word, count in Counter(words).items() if count > 1)
     if twice:
         raise ValueError(f"{path}: words must be unique, got {', '.join(twice[:5])} more than once")
     if not words:

@@ -84,7 +84,8 @@ def test_lerf_ovs_polygons_have_the_area_that_the_file_states():
     for item, area in zip(image.objects, (33084.5, 36045.5), strict=True):
         x, y = item.polygon.T
         assert abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2 == area
-    for category, mask in image.masks().items():
+    for category in image.categories:
+        mask = image.mask(category)
         objects = [item for item in image.objects if item.category == category]
         outline = sum(len(item.polygon) for item in objects) * 40
         area = dict(zip((o.category for o in image.objects), (33084.5, 36045.5), strict=True))[

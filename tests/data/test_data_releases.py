@@ -197,7 +197,7 @@ def test_faults_of_mask_folders_are_named(scene: Scene, tmp_path: Path):
         "mask must be of a class in classes.txt, got 'unheard of'" in f.what for f in with_warning
     )
     masks[0].write_bytes(b"no picture")
-    with pytest.raises(SceneError, match=r"\.png: content must be a PNG"):
+    with pytest.raises(SceneError, match=r"\.png: content must be a whole image"):
         instantiate(composed("data=ovs3d", f"data.root={tmp_path}", "data.scene=bed").data)
     (folder / "classes.txt").write_text("cup\ncup\n")
     with pytest.raises(SceneError, match=r"classes\.txt: classes must be unique names"):

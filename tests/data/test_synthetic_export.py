@@ -14,7 +14,7 @@ from torch import Tensor
 from vlgs.data import colmap
 from vlgs.data.export import write_scene
 from vlgs.data.export.outline import outlines
-from vlgs.data.labels.objects import crosses_itself, fill_polygon
+from vlgs.data.labels.objects import crosses_itself, fill_polygons
 from vlgs.data.synthetic import Recipe, language_levels, load_scene
 from vlgs.types import ObjectLabels, View
 
@@ -143,7 +143,7 @@ def test_filled_outlines_are_the_components_with_holes_closed(seed, share, smoot
     for polygon in polygons:
         x, y = polygon[0]
         want = ndimage.binary_fill_holes(pieces == pieces[y, x])
-        np.testing.assert_array_equal(fill_polygon(polygon.astype(float), 19, 14), want)
+        np.testing.assert_array_equal(fill_polygons([polygon.astype(float)], 19, 14), want)
         assert len(polygon) >= 3
         assert not crosses_itself(polygon.astype(float))
 

@@ -148,7 +148,7 @@ class Autoencoder(nn.Module):
         """
         vectors, areas = _distinct(vectors.detach().float(), areas.detach().float())
         path = self._cache_path(vectors, areas)
-        if path is None or not self._read_cache(path):
+        if path is None or not self._read_cache(path, vectors.shape[1]):
             with _one_thread():
                 self._fit(vectors, areas)
             if path is not None:
@@ -249,13 +249,18 @@ class Autoencoder(nn.Module):
         key.update(areas.numpy().tobytes())
         return self.cache_dir / f"autoencoder_{key.hexdigest()}.safetensors"
 
-    def _read_cache(self, path: Path) -> bool:
+    def _read_cache(self, path: Path, width: int) -> bool:
         try:
             state = load(path.read_bytes())
+            first = state.get("encoder.0.weight", torch.empty(0))
+            if first.shape != (self.encoder_widths[0], width):
+                raise ValueError(f"it must take vectors of {width}, got {list(first.shape)}")
             self.load_state_dict(state)
+            if not all(value.isfinite().all() for value in state.values()):
+                raise ValueError("weights must be finite")
         except FileNotFoundError:
             return False
-        except (OSError, SafetensorError, RuntimeError) as error:
+        except (OSError, SafetensorError, RuntimeError, ValueError) as error:
             log.warning("autoencoder: cache %s is not usable, fitting again: %s", path, error)
             return False
         return True

@@ -1,7 +1,5 @@
 """Image files -> uint8 RGB in the geometry of their COLMAP camera."""
 
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,19 +11,9 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from vlgs.data.faults import Fault, SceneError, listing, warning
+from vlgs.data.untrusted.pictures import picture
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-
-UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
-"""What Pillow raises on a damaged file, besides what it is documented to raise."""
 
 _ORIENTATION = 0x0112
 
@@ -62,13 +50,10 @@ def open_photograph(path: Path, camera_size: tuple[int, int]) -> Photograph:
     Raises:
         SceneError: If the file cannot be read or has another shape than the camera.
     """
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-            orientation = image.getexif().get(_ORIENTATION, 1)
-            mode, alpha = image.mode, image.has_transparency_data
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from error
+    with picture(path) as image:
+        width, height = image.size
+        orientation = image.getexif().get(_ORIENTATION, 1)
+        mode, alpha = image.mode, image.has_transparency_data
     if mode in ("I", "F"):
         raise SceneError(Fault(str(path), f"pixels must be 8 or 16 bit integers, got mode {mode}"))
     tagged = orientation not in (0, 1)
@@ -87,11 +72,8 @@ def read_photograph(photograph: Photograph) -> UInt8[Tensor, "h w 3"]:
     Raises:
         SceneError: If the file is truncated or damaged.
     """
-    try:
-        with Image.open(photograph.path) as image:
-            rgb = _to_rgb(ImageOps.exif_transpose(image) if photograph.turned else image)
-    except UNREADABLE as error:
-        raise _unreadable(photograph.path, error) from error
+    with picture(photograph.path, decode=True) as image:
+        rgb = _to_rgb(ImageOps.exif_transpose(image) if photograph.turned else image)
     return torch.from_numpy(np.array(rgb))
 
 
@@ -113,9 +95,9 @@ def transparency_warnings(photographs: Sequence[Photograph], folder: Path) -> It
 
 def _has_transparent_pixels(path: Path) -> bool:
     try:
-        with Image.open(path) as image:
+        with picture(path, decode=True) as image:
             return bool(np.asarray(image.convert("RGBA").getchannel("A")).min(initial=255) < 255)
-    except UNREADABLE:  # said where it is read
+    except SceneError:  # said where it is read
         return False
 
 
@@ -149,9 +131,3 @@ def _to_rgb(image: Image.Image) -> Image.Image:
             "RGB"
         )
     return image.convert("RGB")
-
-
-def _unreadable(path: Path, error: BaseException) -> SceneError:
-    size = path.stat().st_size if path.is_file() else 0
-    what = f"content must be a whole image, got {size} bytes that do not decode ({error})"
-    return SceneError(Fault(str(path), what, "copy the file again"))

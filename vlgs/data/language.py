@@ -5,7 +5,6 @@ for none; ids run on from level to level. ``<stem>_f.npy`` [M, e] holds one unit
 """
 
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +13,14 @@ import torch
 from jaxtyping import Float, Float32, Int32, Shaped
 
 from vlgs.data.faults import Fault, SceneError
+from vlgs.data.untrusted.arrays import Archive, map_npy
+from vlgs.data.untrusted.text import read_json
 from vlgs.files import write_atomically
 from vlgs.types import Vocabulary
 
 LEVELS = 4
 
-_NOT_AN_ARRAY = (ValueError, OSError, EOFError, KeyError, SyntaxError, UnicodeDecodeError)
-"""What NumPy raises on a file that is no array, or is one of Python objects."""
+_VOCABULARY = "an npz with names and embeddings or a JSON {name: vector}"
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def read_mask_vectors(files: MaskFiles) -> Float32[np.ndarray, "m e"]:
     Raises:
         SceneError: If the file is not an array [M, e] of finite rows of unit length within 1 %.
     """
-    vectors = _load(files.vectors)
+    vectors = map_npy(files.vectors)
     if vectors.ndim != 2 or vectors.dtype.kind != "f" or not vectors.shape[1]:
         what = f"array must be floats [M, e], got {vectors.dtype} {list(vectors.shape)}"
         raise SceneError(Fault(str(files.vectors), what))
@@ -143,11 +143,12 @@ def read_vocabulary(path: Path) -> Vocabulary:
         raise FileNotFoundError(f"vocabulary: file must exist, got {path}")
     try:
         names, vectors = _read_npz(path) if path.suffix == ".npz" else _read_json(path)
-    except (*_NOT_AN_ARRAY, TypeError, AttributeError, RecursionError) as error:
-        what = "content must be an npz with names and embeddings or a JSON {name: vector}"
-        raise SceneError(
-            Fault(str(path), f"{what}, got {type(error).__name__}: {error}")
-        ) from error
+        "".join(names).encode()  # half of a surrogate pair cannot be printed or written
+    except SceneError:
+        raise
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        what = f"content must be {_VOCABULARY}, got {type(error).__name__}: {error}"
+        raise SceneError(Fault(str(path), what[:400])) from error
     if vectors.ndim != 2 or len(vectors) != len(names) or not names:
         what = (
             f"embeddings must be [{len(names)}, e], a row for each name, got {list(vectors.shape)}"
@@ -165,28 +166,21 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
 
 def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    with np.load(path, allow_pickle=False) as archive:
-        names = archive["classes" if "classes" in archive else "names"]
-        return tuple(map(str, names.tolist())), archive["embeddings"].astype(np.float64)
+    with Archive(path, _VOCABULARY) as archive:
+        names = archive.read("classes" if "classes" in archive else "names", "U")
+        if names.ndim != 1:
+            raise archive.fail(f"names of shape {list(names.shape)}")
+        return tuple(names.tolist()), archive.read("embeddings").astype(np.float64)
 
 
 def _read_json(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path, _VOCABULARY)
     return tuple(content), np.array(list(content.values()), np.float64)
 
 
 def _open_ids(path: Path) -> np.ndarray:
-    ids = _load(path)
+    ids = map_npy(path)
     if ids.ndim != 3 or ids.shape[0] != LEVELS or ids.dtype.kind not in "fiu" or 0 in ids.shape:
         what = f"array must be numbers [{LEVELS}, height, width], got {ids.dtype} {list(ids.shape)}"
         raise SceneError(Fault(str(path), what))
     return ids
-
-
-def _load(path: Path) -> np.ndarray:
-    """The array of an npy file, left on disk until it is looked at."""
-    try:
-        return np.lib.format.open_memmap(path, mode="r")
-    except _NOT_AN_ARRAY as error:
-        what = f"content must be a whole npy array of numbers, got {type(error).__name__}: {error}"
-        raise SceneError(Fault(str(path), what, "write the file again")) from error

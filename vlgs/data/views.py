@@ -1,6 +1,6 @@
 """One view's files behind the readers of `vlgs.types.View`: decoded when asked, warped by one lens, kept within a limit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from vlgs.data.cache import PixelCache
 from vlgs.data.faults import Fault, SceneError
 from vlgs.data.images import Photograph, read_photograph
 from vlgs.data.labels import DenseFolder, ObjectFolder
+from vlgs.data.labels.objects import ObjectImage
 from vlgs.data.language import MaskFiles, read_mask_ids
 from vlgs.data.lens import (
     Lens,
@@ -87,11 +88,8 @@ class ViewSource:
             in_file = rows * np.tile(np.divide(self.lens.file_size, (image.width, image.height)), 2)
             moved = move_boxes(in_file, self.lens)
             boxes[category] = torch.from_numpy(moved.clip(0, [width, height] * 2)).float()
-        masks = {
-            category: torch.from_numpy(self.warp(mask, fill=0))
-            for category, mask in image.masks().items()
-        }
-        return ObjectLabels(masks, boxes)
+        # One at a time: thousands of categories do not fit into memory side by side.
+        return ObjectLabels(_Masks(image.categories, lambda c: self._warp_mask(image, c)), boxes)
 
     def read_valid(self) -> Bool[Tensor, "h w"]:
         """Whether the photograph covers a pixel."""
@@ -116,6 +114,9 @@ class ViewSource:
         warped = values.ravel().take(index, mode="clip")
         warped[index < 0] = fill
         return warped
+
+    def _warp_mask(self, image: ObjectImage, category: str) -> Bool[Tensor, "h w"]:
+        return torch.from_numpy(self.warp(image.mask(category), fill=0))
 
     def _decoded(self, what: str, make: Callable[[], Tensor]) -> Tensor:
         return self.cache.get((what, self.name), make) if self.keep else make()
@@ -146,6 +147,25 @@ class ViewSource:
         if got != self.lens.file_size:
             what = f"size must still be {self.lens.file_size}, got {got}"
             raise SceneError(Fault(str(self.photograph.path), what))
+
+
+class _Masks(Mapping[str, Bool[Tensor, "h w"]]):
+    """Category -> mask, made when it is asked for."""
+
+    def __init__(self, categories: Iterable[str], make: Callable[[str], Tensor]) -> None:
+        self._categories = dict.fromkeys(categories)
+        self._make = make
+
+    def __getitem__(self, category: str) -> Bool[Tensor, "h w"]:
+        if category not in self._categories:
+            raise KeyError(category)
+        return self._make(category)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._categories)
+
+    def __len__(self) -> int:
+        return len(self._categories)
 
 
 def map_sizes(lens: Lens, camera_size: tuple[int, int]) -> list[tuple[int, int]]:

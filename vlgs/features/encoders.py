@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
+from vlgs.data.untrusted.arrays import map_npy
 from vlgs.features.masks import Mask
 from vlgs.features.weights import Pretrained
 
@@ -170,12 +171,7 @@ class DenseMaps:
             raise FileNotFoundError(
                 f"features: {path} must be the feature map of photograph {stem}, got no such file"
             )
-        try:
-            cells = np.lib.format.open_memmap(path, mode="r")
-        except (ValueError, OSError, EOFError) as error:
-            raise ValueError(
-                f"{path}: content must be a whole npy array of numbers, got {error}"
-            ) from error
+        cells = map_npy(path)
         if cells.ndim != 3 or cells.dtype.kind != "f" or 0 in cells.shape:
             raise ValueError(
                 f"{path}: array must be floats [{', '.join(self.layout)}], got {cells.dtype} {list(cells.shape)}"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlgs.data.language import MaskFiles, find_mask_files
+from vlgs.data.untrusted.text import read_json
 from vlgs.features.extractor import LEVELS, MaskFeatures
 from vlgs.files import write_atomically
 
@@ -37,10 +38,10 @@ class FeatureFolder:
                 )
             return
         try:
-            before = json.loads(file.read_text(encoding="utf-8"))
+            before = read_json(file, "a JSON of settings")
             if not isinstance(before, dict):
                 raise TypeError(f"{type(before).__name__} instead of a mapping")
-        except (ValueError, TypeError) as error:
+        except TypeError as error:
             raise ValueError(f"{file}: content must be a JSON of settings, got {error}") from error
         old, new = _flat(before), _flat(settings)
         changed = sorted(k for k in old.keys() | new.keys() if old.get(k) != new.get(k))

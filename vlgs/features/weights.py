@@ -1,12 +1,14 @@
 """Weights of pretrained models: where they lie on this machine, whose bytes they are, and what to do if they are missing."""
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from vlgs.data.faults import SceneError
+from vlgs.data.untrusted.text import read_json
 
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"
 WEIGHTS, SHARDS = "model.safetensors", "model.safetensors.index.json"
@@ -85,9 +87,11 @@ class Pretrained:
         """
         path = self.folder() / PREPROCESSING
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path, "image_mean and image_std of three channels")
             if len(content["image_mean"]) != 3 or len(content["image_std"]) != 3:
                 raise ValueError("not three channels")
+        except SceneError:
+            raise
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path}: content must be image_mean and image_std of three channels, got {type(error).__name__}: {error}"

@@ -12,9 +12,10 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float32
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from torch import Tensor, nn
 
+from vlgs.data.untrusted.ply import read_vertices
 from vlgs.files import write_atomically
 from vlgs.gaussians.parameters import complete
 from vlgs.gaussians.sound import require_sound
@@ -122,13 +123,14 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
         ValueError: If it is not a PLY file, is cut short or lacks a property.
     """
     path = Path(path)
-    vertices = _read_vertices(path)
-    present = set(vertices.dtype.names or ())
+    vertices = read_vertices(path)
+    present = set(vertices)
     if "packed_position" in present:
         raise ValueError(
             f"ply {path}: must be uncompressed, got the compressed.ply of PlayCanvas and SuperSplat; export it as PLY "
             "there, or: npx @playcanvas/splat-transform IN plain.ply"
         )
+    count = len(next(iter(vertices.values()), ()))
     n_rest = sum(name.startswith("f_rest_") for name in present)
     if n_rest not in [3 * count for count in SH_COEFFICIENTS]:
         raise ValueError(f"ply {path}: f_rest properties must be 0, 9, 24 or 45, got {n_rest}")
@@ -136,9 +138,9 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
     n_lang = sum(name.startswith(f"{stem}_") for name in present)
 
     def take(*names: str) -> Float32[Tensor, "n c"]:
-        columns = np.empty((len(vertices), len(names)), np.float32)
+        columns = np.empty((count, len(names)), np.float32)
         for index, name in enumerate(names):
-            if name not in present or vertices.dtype[name].kind not in "fiu":
+            if name not in present:
                 raise ValueError(
                     f"ply {path}: vertex must have the numeric property {name}, got none"
                 )
@@ -158,24 +160,14 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
     if "indicator" in present:
         params["indicator_logits"] = take("indicator")[:, 0]
     elif "indicator_0" in present:
-        count = sum(name.startswith("indicator_") for name in present)
-        params["indicator_logits"] = take(*_numbered("indicator", count))
+        n_levels = sum(name.startswith("indicator_") for name in present)
+        params["indicator_logits"] = take(*_numbered("indicator", n_levels))
     if n_lang:
         params["features"] = take(*_numbered(stem, n_lang))
     if "language_rot_0" in present:
         params["language_quats"] = take(*_numbered("language_rot", 4))
         params["language_log_scales"] = take(*_numbered("language_scale", 3))
     return params
-
-
-def _read_vertices(path: Path) -> np.ndarray:
-    try:
-        ply = PlyData.read(str(path))  # mapped; the columns are copied before this module returns
-    except (PlyParseError, UnicodeDecodeError, ValueError, MemoryError, OverflowError) as error:
-        raise ValueError(f"ply {path}: must be a complete PLY file, got {error}") from error
-    if "vertex" not in ply:
-        raise ValueError(f"ply {path}: must have an element vertex, got {[e.name for e in ply]}")
-    return ply["vertex"].data
 
 
 def _numbered(stem: str, count: int) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """LangSplat's autoencoder weights (systems.md C.5) as our codec, and back."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ def read_autoencoder(path: str | Path) -> Autoencoder:
     """
     who = f"autoencoder {path}"
     state = _load(Path(path))
-    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
         raise ValueError(f"{who}: must be a state dict of tensors, got a {type(state).__name__}")
-    encoder, decoder = _widths(state, "encoder"), _widths(state, "decoder")
+    encoder, decoder = _widths(who, state, "encoder"), _widths(who, state, "decoder")
     if len(encoder) < 3 or len(decoder) < 3:
         what = "must have encoder.0.weight, ... and decoder.0.weight, ... of two layers or more"
         raise ValueError(f"{who}: {what}, got {len(encoder)} and {len(decoder)} widths")
@@ -95,7 +98,7 @@ def write_autoencoder(path: str | Path, codec: Autoencoder) -> None:
     save_plain(path, {name: value.detach().clone() for name, value in state.items()})
 
 
-def _widths(state: Mapping[str, Any], part: str) -> list[int]:
+def _widths(who: str, state: Mapping[str, Any], part: str) -> list[int]:
     """Widths from input to output: those of the weights that are matrices, in the order of the layers."""
     matrices = {
         int(name.split(".")[1]): value
@@ -106,4 +109,9 @@ def _widths(state: Mapping[str, Any], part: str) -> list[int]:
         and name.split(".")[1].isdecimal()
     }
     shapes = [matrices[index].shape for index in sorted(matrices)]
+    # Before a network is laid out: empty matrices may have any width and take no byte of the file.
+    fits = all(before[0] == after[1] for before, after in pairwise(shapes))
+    if not fits or any(0 in shape for shape in shapes):
+        got = [list(shape) for shape in shapes[:12]]
+        raise ValueError(f"{who}: layers of the {part} must follow each other, got {got}")
     return [shapes[0][1], *(shape[0] for shape in shapes)] if shapes else []

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vlgs.data.untrusted import read_bytes
 from vlgs.files import write_atomically
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 
@@ -33,7 +34,7 @@ def parse_splat(path: str | Path) -> dict[str, Tensor]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"splat {path}: file must exist, got none")
-    data = path.read_bytes()
+    data = read_bytes(path)
     if len(data) % _ROW.itemsize:
         left = len(data) % _ROW.itemsize
         what = f"must be rows of {_ROW.itemsize} bytes, got {len(data)} bytes"

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from vlgs.blend import UniformBlend, blend_camera
+from vlgs.data.untrusted.arrays import Archive
 from vlgs.files import write_atomically
 from vlgs.module.sampler import nearest_views
 from vlgs.render.model import SplatModel
@@ -142,8 +143,9 @@ class Offline:
             np.savez(stream, ids=found.ids, vectors=found.vectors)
             folder.mkdir(parents=True, exist_ok=True)
             write_atomically(path, stream.getvalue())
-        with np.load(path, allow_pickle=False) as kept:
-            index, every = torch.from_numpy(kept["ids"][level]), torch.from_numpy(kept["vectors"])
+        with Archive(path, "the maps of an added view (delete it: it is made again)") as kept:
+            index = torch.from_numpy(kept.read("ids")[level])
+            every = torch.from_numpy(kept.read("vectors"))
         rows, compact = index.unique(return_inverse=True)
         first = int(rows[0] < 0)
         return (compact - first).int(), every[rows[rows >= 0].long()]

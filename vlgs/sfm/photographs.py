@@ -4,8 +4,9 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from vlgs.data.faults import listing
-from vlgs.data.images import SUFFIXES, UNREADABLE
+from vlgs.data.faults import SceneError, listing
+from vlgs.data.images import SUFFIXES
+from vlgs.data.untrusted.pictures import picture
 
 Device = tuple[tuple[int, int], tuple[str, ...]]
 """Width and height; make, model and focal length from EXIF."""
@@ -25,10 +26,10 @@ def find_photographs(images: Path) -> dict[Device, list[str]]:
     broken = []
     for path in paths:
         try:
-            with Image.open(path) as image:
+            with picture(path) as image:
                 device = image.size, _exif_camera(image)
-        except UNREADABLE as error:
-            broken.append(f"{path.name} ({error})")
+        except SceneError as error:
+            broken.append(f"{path.name} ({error.fault.what})")
             continue
         groups.setdefault(device, []).append(path.relative_to(images).as_posix())
     if broken:

@@ -5,17 +5,17 @@
 Pixels of a class that is ignored, and pixels with id 255, take no part in any score. `kind` is optional.
 """
 
-import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from vlgs.data.faults import Fault, SceneError, listing
-from vlgs.data.images import UNREADABLE
+from vlgs.data.untrusted.pictures import picture
+from vlgs.data.untrusted.text import read_json
 from vlgs.types import IGNORE_ID
 
 KINDS = ("translucent_reflective", "other")
@@ -42,13 +42,13 @@ class DenseFolder:
             SceneError: If the file does not decode or has an id that ``classes.json`` lacks.
         """
         path = self.files[stem]
-        try:
-            with Image.open(path) as image:
-                ids = np.asarray(image)
-        except UNREADABLE as error:
-            raise SceneError(
-                Fault(str(path), f"content must be a whole PNG, got {error}")
-            ) from error
+        with picture(path, decode=True) as image:
+            ids = np.asarray(image)
+        if ids.dtype != np.uint8 or ids.shape != self.sizes[stem][::-1]:
+            what = (
+                f"must still be 8-bit ids of {self.sizes[stem]}, got {ids.dtype} {ids.shape[::-1]}"
+            )
+            raise SceneError(Fault(str(path), what))
         unknown = sorted(set(np.unique(ids).tolist()) - set(self.position))
         if unknown:
             expected = f"ids of classes.json ({listing(map(str, sorted(self.position)), 20)})"
@@ -63,12 +63,15 @@ class DenseFolder:
 def open_dense(folder: Path) -> tuple[DenseFolder | None, tuple[Fault, ...]]:
     """Read ``classes.json`` and the headers of the PNGs; see `vlgs.data.labels.open_labels`."""
     path = folder / "classes.json"
+    expected = '{"classes": {"<id>": {"name": ...}}}'
     try:
-        listed = json.loads(path.read_text(encoding="utf-8"))["classes"]
+        listed = read_json(path, expected)["classes"]
         faults = list(_class_faults(str(path), listed))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        what = f'content must be {{"classes": {{"<id>": {{"name": ...}}}}}}, got {type(error).__name__}: {error}'
-        return None, (Fault(str(path), what),)
+    except SceneError as error:
+        return None, (error.fault,)
+    except (KeyError, TypeError, AttributeError) as error:
+        what = f"content must be {expected}, got {type(error).__name__}: {error}"
+        return None, (Fault(str(path), what[:400]),)
     if faults:
         return None, tuple(faults)
     by_id = sorted((int(key), entry) for key, entry in listed.items())
@@ -94,8 +97,8 @@ def open_dense(folder: Path) -> tuple[DenseFolder | None, tuple[Fault, ...]]:
 def _class_faults(file: str, listed: Mapping[str, dict]) -> Iterator[Fault]:
     names = []
     for key, entry in listed.items():
-        if not key.isascii() or not key.isdecimal() or int(key) >= IGNORE_ID:
-            yield Fault(file, f"class id must be 0 to {IGNORE_ID - 1}, got {key!r}")
+        if not re.fullmatch("[0-9]{1,9}", key) or int(key) >= IGNORE_ID:
+            yield Fault(file, f"class id must be 0 to {IGNORE_ID - 1}, got {key[:40]!r}")
         name, kind, ignored = (
             entry.get("name"),
             entry.get("kind", "other"),
@@ -115,11 +118,8 @@ def _class_faults(file: str, listed: Mapping[str, dict]) -> Iterator[Fault]:
 
 
 def _png_size(path: Path) -> tuple[int, int]:
-    try:
-        with Image.open(path) as image:
-            mode, size = image.mode, image.size
-    except UNREADABLE as error:
-        raise SceneError(Fault(str(path), f"content must be a PNG, got {error}")) from error
+    with picture(path) as image:
+        mode, size = image.mode, image.size
     if mode not in ("L", "P"):
         advice = "write class ids, not colours"
         raise SceneError(

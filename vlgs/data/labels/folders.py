@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from PIL import Image
 
 from vlgs.data.faults import Fault, SceneError, listing, warning
-from vlgs.data.images import UNREADABLE
 from vlgs.data.labels.objects import ObjectFolder
+from vlgs.data.untrusted.pictures import picture
+from vlgs.data.untrusted.text import read_text
 
 
 @dataclass(frozen=True)
@@ -35,30 +35,25 @@ class MaskedImage:
         return tuple(self.by_category.values())
 
     @property
-    def categories(self) -> frozenset[str]:
+    def categories(self) -> tuple[str, ...]:
         """Classes that the image has a mask of."""
-        return frozenset(self.by_category)
+        return tuple(self.by_category)
 
-    def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
-        """Category -> mask.
+    def mask(self, category: str) -> Bool[np.ndarray, "h w"]:
+        """The mask of a category.
 
         Raises:
-            SceneError: If a file does not decode or has changed its size.
+            SceneError: If the file does not decode or has changed its size.
         """
-        return {category: self._read(path) for category, path in self.by_category.items()}
+        return self._read(self.by_category[category])
 
     def boxes(self) -> dict[str, Float64[np.ndarray, "b 4"]]:
         """None."""
         return {}
 
     def _read(self, path: Path) -> Bool[np.ndarray, "h w"]:
-        try:
-            with Image.open(path) as image:
-                pixels = np.asarray(image.convert("RGB")).max(axis=2) > 0
-        except UNREADABLE as error:
-            raise SceneError(
-                Fault(str(path), f"content must be a whole PNG, got {error}")
-            ) from error
+        with picture(path, decode=True) as image:
+            pixels = np.asarray(image.convert("RGB")).max(axis=2) > 0
         if pixels.shape != (self.height, self.width):
             what = f"size must be {self.width} x {self.height}, got {pixels.shape[::-1]}"
             raise SceneError(Fault(str(path), what))
@@ -69,9 +64,9 @@ def open_class_folders(folder: Path) -> tuple[ObjectFolder | None, tuple[Fault, 
     """3D-OVS's ``segmentations``; classes come sorted, as the original evaluation has them."""
     path = folder / "classes.txt"
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        return None, (Fault(str(path), f"content must be UTF-8 text, got {error}"),)
+        lines = read_text(path).splitlines()
+    except SceneError as error:
+        return None, (error.fault,)
     classes = tuple(sorted(line.strip() for line in lines if line.strip()))
     if not classes or len(set(classes)) < len(classes):
         what = f"classes must be unique names, one per line, got {listing(classes)}"
@@ -108,10 +103,10 @@ def _open(
         sizes: dict[Path, tuple[int, int]] = {}
         for mask in masks.values():
             try:
-                with Image.open(mask) as image:
+                with picture(mask) as image:
                     sizes[mask] = image.size
-            except UNREADABLE as error:
-                faults.append(Fault(str(mask), f"content must be a PNG, got {error}"))
+            except SceneError as error:
+                faults.append(error.fault)
         if not sizes:
             continue
         first, size = next(iter(sizes.items()))

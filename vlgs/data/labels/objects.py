@@ -4,10 +4,10 @@
  "objects": [{"category": "plate", "segmentation": [[x, y], ...], "bbox": [x1, y1, x2, y2]}]}
 """
 
-import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,9 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from PIL import Image, ImageDraw
 
-from vlgs.data.faults import Fault, warning
+from vlgs.data.faults import Fault, SceneError, warning
+from vlgs.data.untrusted.text import read_json
 
-_MOST_CORNERS = 100_000
+_MOST_CORNERS = 1_000_000
+_CROSSING = 500
+"""Corners up to which a crossing is looked for, at a cost that goes with their square; beyond, the even-odd rule is not warned of."""
+_MOST_PIXELS = 1 << 31
+"""Categories times pixels of an image: 170 categories on 12 megapixels. Each category becomes a mask."""
 
 
 @dataclass(frozen=True)
@@ -46,24 +51,28 @@ class LabelledImage:
         return (self.path,)
 
     @property
-    def categories(self) -> frozenset[str]:
-        """What is labelled in the image."""
-        return frozenset(item.category for item in self.objects)
+    def categories(self) -> tuple[str, ...]:
+        """What is labelled in the image, in the file's order."""
+        return tuple(self._by_category)
 
-    def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
-        """Category -> union of its instances, at the JSON's image size."""
-        merged: dict[str, np.ndarray] = {}
-        for item in self.objects:
-            mask = fill_polygon(item.polygon, self.width, self.height)
-            merged[item.category] = merged.get(item.category, False) | mask
-        return merged
+    def mask(self, category: str) -> Bool[np.ndarray, "h w"]:
+        """Union of the instances of a category, at the JSON's image size."""
+        polygons = [item.polygon for item in self._by_category[category]]
+        return fill_polygons(polygons, self.width, self.height)
 
     def boxes(self) -> dict[str, Float64[np.ndarray, "b 4"]]:
         """Category -> one box per instance, in the file's order."""
-        rows: dict[str, list[np.ndarray]] = {}
+        return {
+            category: np.stack([item.box for item in items])
+            for category, items in self._by_category.items()
+        }
+
+    @cached_property
+    def _by_category(self) -> dict[str, list[LabelledObject]]:
+        grouped: dict[str, list[LabelledObject]] = {}
         for item in self.objects:
-            rows.setdefault(item.category, []).append(item.box)
-        return {category: np.stack(boxes) for category, boxes in rows.items()}
+            grouped.setdefault(item.category, []).append(item)
+        return grouped
 
 
 @runtime_checkable
@@ -77,8 +86,8 @@ class ObjectImage(Protocol):
     @property
     def files(self) -> tuple[Path, ...]: ...  # noqa: D102
     @property
-    def categories(self) -> frozenset[str]: ...  # noqa: D102
-    def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]: ...  # noqa: D102
+    def categories(self) -> tuple[str, ...]: ...  # noqa: D102
+    def mask(self, category: str) -> Bool[np.ndarray, "h w"]: ...  # noqa: D102
     def boxes(self) -> dict[str, Float64[np.ndarray, "b 4"]]: ...  # noqa: D102
 
 
@@ -135,12 +144,14 @@ def open_objects(folder: Path) -> tuple[ObjectFolder, tuple[Fault, ...]]:
 def read_labelled_image(path: Path) -> tuple[LabelledImage | None, tuple[Fault, ...]]:
     """One JSON file and what is wrong with it; None if it cannot be used at all."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "LERF-OVS labels (info, objects)")
         info, listed = content["info"], content["objects"]
         width, height, name = info["width"], info["height"], info.get("name", path.name)
         if not isinstance(listed, list) or not isinstance(name, str):
             raise TypeError("objects is not a list, or info.name is not a text")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except SceneError as error:
+        return None, (error.fault,)
+    except (KeyError, TypeError, AttributeError) as error:
         what = (
             f"content must be LERF-OVS labels (info, objects), got {type(error).__name__}: {error}"
         )
@@ -149,35 +160,49 @@ def read_labelled_image(path: Path) -> tuple[LabelledImage | None, tuple[Fault, 
         what = f"info.width and info.height must be pixels, got {width!r} and {height!r}"
         return None, (Fault(str(path), what),)
     faults, objects = [], []
+    known: set[tuple[str, bytes]] = set()
     if Path(name).stem != path.stem:
         faults.append(warning(path, f"info.name must be the file's own stem, got {name!r}"))
     for number, entry in enumerate(listed):
         item, found = _read_object(entry, (width, height))
         where = f"object {number}"
         faults += [Fault(str(path), f.what, f.advice, where, f.severity) for f in found]
-        if item is not None and any(_is_same(item, other) for other in objects):
+        if item is None:
+            continue
+        if (same := (item.category, item.polygon.tobytes())) in known:
             faults.append(
                 warning(path, f"objects must differ, got {item.category!r} twice", where=where)
             )
-        elif item is not None:
+        else:
+            known.add(same)
             objects.append(item)
+    categories = len({item.category for item in objects})
+    if categories * width * height > _MOST_PIXELS:
+        what = (
+            f"categories times pixels must be at most {_MOST_PIXELS}, got {categories} categories on "
+            f"{width} x {height} pixels"
+        )
+        advice = "name fewer categories, or label a scaled copy of the image"
+        return None, (*faults, Fault(str(path), what, advice))
     return LabelledImage(path, width, height, tuple(objects)), tuple(faults)
 
 
-def fill_polygon(
-    polygon: Float64[np.ndarray, "p 2"], width: int, height: int
+def fill_polygons(
+    polygons: Iterable[Float64[np.ndarray, "_ 2"]], width: int, height: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels inside a polygon or on its outline, corners cut to whole pixels, as the LERF-OVS evaluation fills it.
+    """Pixels inside polygons or on their outlines, corners cut to whole pixels, as the LERF-OVS evaluation fills them.
 
-    Where the outline crosses itself the even-odd rule decides.
+    Where an outline crosses itself the even-odd rule decides; what another polygon has filled stays filled.
 
     Example:
-        >>> int(fill_polygon(np.array([[1.0, 1.0], [3.9, 1.0], [3.9, 2.0], [1.0, 2.0]]), 8, 8).sum())
+        >>> int(fill_polygons([np.array([[1.0, 1.0], [3.9, 1.0], [3.9, 2.0], [1.0, 2.0]])], 8, 8).sum())
         6
     """
     canvas = Image.new("L", (width, height))
-    corners = [(int(x), int(y)) for x, y in polygon]
-    ImageDraw.Draw(canvas).polygon(corners, fill=1, outline=1)
+    draw = ImageDraw.Draw(canvas)
+    for polygon in polygons:
+        corners = polygon.astype(np.int64).ravel().tolist()  # cut towards zero
+        draw.polygon(corners, fill=1, outline=1)
     return np.asarray(canvas, bool)
 
 
@@ -219,12 +244,11 @@ def _geometry_faults(item: LabelledObject, size: tuple[int, int]) -> Iterator[Fa
         what = f"{item.category}: bbox must bound the polygon {bounds}, got {item.box}"
         yield warning("", what, guess)
     x, y = item.polygon.T
-    if abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) < 1 and not crosses_itself(
-        item.polygon
-    ):
+    crossing = len(item.polygon) <= _CROSSING and crosses_itself(item.polygon)
+    if abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) < 1 and not crossing:
         what = f"{item.category}: polygon must enclose an area, got corners on a line"
         yield warning("", what, "its outline is what is labelled")
-    if crosses_itself(item.polygon):
+    if crossing:
         what = f"{item.category}: polygon must not cross itself, got a crossing"
         yield warning("", what, "the even-odd rule fills it")
 
@@ -234,25 +258,13 @@ def crosses_itself(polygon: Float64[np.ndarray, "p 2"]) -> bool:
 
     Edges that only touch do not count: labelling tools write them.
     """
-    start, end = polygon, np.roll(polygon, -1, axis=0)
-    edge = end - start
-
-    def side(points: np.ndarray, i: int) -> np.ndarray:
-        """Sign of the area that edge i spans with each of the points."""
-        to = points - start[i]
-        return np.sign(edge[i, 0] * to[:, 1] - edge[i, 1] * to[:, 0])
-
-    for i in range(len(polygon) - 2):
-        a, b = start[i + 2 :], end[i + 2 :]
-        apart = side(a, i) * side(b, i) < 0
-        if apart.any():
-            j = np.flatnonzero(apart) + i + 2
-            to_start, to_end = start[i] - start[j], end[i] - start[j]
-            s = np.sign(edge[j, 0] * to_start[:, 1] - edge[j, 1] * to_start[:, 0])
-            e = np.sign(edge[j, 0] * to_end[:, 1] - edge[j, 1] * to_end[:, 0])
-            if (s * e < 0).any():
-                return True
-    return False
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    to = polygon[None] - polygon[:, None]  # [i, j]: from corner i to corner j
+    # Side of edge i on which corner j lies; 0 for its own two.
+    side = np.sign(edge[:, None, 0] * to[..., 1] - edge[:, None, 1] * to[..., 0])
+    side[np.arange(len(edge)), np.arange(1, len(edge) + 1) % len(edge)] = 0
+    apart = side * np.roll(side, -1, axis=1) < 0  # edge j has its ends on both sides of edge i
+    return bool((apart & apart.T).any())
 
 
 def _numbers(value: Any, columns: int | None) -> np.ndarray | None:
@@ -270,7 +282,3 @@ def _numbers(value: Any, columns: int | None) -> np.ndarray | None:
     if not np.isfinite(array).all():
         return None
     return array if columns is not None else array[0]
-
-
-def _is_same(a: LabelledObject, b: LabelledObject) -> bool:
-    return a.category == b.category and np.array_equal(a.polygon, b.polygon)

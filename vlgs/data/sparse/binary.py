@@ -12,6 +12,7 @@ from jaxtyping import Float64, UInt8
 
 from vlgs.data.faults import Fault, SceneError, listing
 from vlgs.data.sparse.model import CAMERA_MODELS, SparseCamera, SparseImage
+from vlgs.data.untrusted import read_bytes
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
@@ -27,7 +28,7 @@ class _Reader:
 
     def __init__(self, path: Path):
         self.path = path
-        self.data = path.read_bytes()
+        self.data = read_bytes(path)
         self.at = 0
 
     def fail(self, what: str, at: int | None = None) -> SceneError:

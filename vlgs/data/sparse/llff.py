@@ -12,6 +12,7 @@ import torch
 from vlgs.data.faults import Fault, SceneError
 from vlgs.data.images import SUFFIXES
 from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
+from vlgs.data.untrusted.arrays import map_npy
 from vlgs.geometry import rotmat_to_quat
 
 FILE = "poses_bounds.npy"
@@ -23,10 +24,7 @@ def read_llff(path: Path) -> SparseModel:
     Raises:
         SceneError: If the file is not such an array, or has not one row for each image.
     """
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise SceneError(Fault(str(path), f"content must be an npy array, got {error}")) from error
+    rows = map_npy(path)
     names = sorted(
         p.name for p in (path.parent / "images").iterdir() if p.suffix.lower() in SUFFIXES
     )

@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Set
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -51,6 +52,8 @@ ONE_FOCAL_LENGTH = frozenset(
 
 _LARGEST = float(np.finfo(np.float32).max)
 _LARGEST_SIDE = 1 << 17
+_LONGEST_NAME = 255
+"""Bytes of a file's or folder's name, on any system in use."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +146,8 @@ def image_faults(image: SparseImage, cameras: Set[int], file: str) -> Iterator[F
     if not _stays_below(image.name):
         yield Fault(file, f"{who}: name must be a path below the image folder, got {image.name!r}")
     if image.camera_id not in cameras:
-        expected = f"one of {listing(map(str, sorted(cameras)))}"
+        # Of the first few: thousands of images that are at fault list them each.
+        expected = f"one of {listing(map(str, islice(cameras, 10)))}"
         yield Fault(file, f"{who}: camera id must be {expected}, got {image.camera_id}")
     if not _finite(image.quat + image.translation):
         yield Fault(file, f"{who}: pose must be finite, got {image.quat} {image.translation}")
@@ -184,4 +188,6 @@ def _stays_below(name: str) -> bool:
     """Whether a name from a file can be joined to a folder without leaving it, on any system."""
     drive_or_control = re.match(r"[A-Za-z]:|.*[\x00-\x1f\x7f]", name, re.DOTALL)
     path = PurePosixPath(name.replace("\\", "/"))
-    return bool(path.name) and not (drive_or_control or path.is_absolute() or ".." in path.parts)
+    fits = all(len(part.encode()) <= _LONGEST_NAME for part in path.parts) and len(name) < 4096
+    outside = drive_or_control or path.is_absolute() or ".." in path.parts
+    return bool(path.name) and fits and not outside

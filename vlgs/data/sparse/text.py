@@ -9,6 +9,7 @@ from jaxtyping import Float64, UInt8
 
 from vlgs.data.faults import Fault, SceneError, listing
 from vlgs.data.sparse.model import PARAMETERS, SparseCamera, SparseImage
+from vlgs.data.untrusted.text import read_text
 
 T = TypeVar("T")
 
@@ -121,16 +122,7 @@ def _records(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise SceneError(
-            Fault(
-                str(path),
-                "content must be UTF-8 text, got other bytes",
-                where=f"byte {error.start}",
-            )
-        ) from error
+    return read_text(path).splitlines()
 
 
 def _is_blank(line: str) -> bool:

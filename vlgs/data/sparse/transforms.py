@@ -5,22 +5,26 @@ the original world (``applied_transform``, ``applied_scale``) is undone, so that
 instant-ngp records no such thing: its world stays as it is. Points come from ``ply_file_path``, if there is one.
 """
 
+import glob
 import io
 import json
 import math
+from collections import ChainMap
 from collections.abc import Mapping
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
-from PIL import Image
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from vlgs.data.faults import Fault, SceneError
-from vlgs.data.images import UNREADABLE
 from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
+from vlgs.data.untrusted.pictures import picture
+from vlgs.data.untrusted.ply import read_vertices
+from vlgs.data.untrusted.text import read_json
 from vlgs.files import write_atomically
 from vlgs.geometry import quat_to_rotmat, rotmat_to_quat
 
@@ -30,6 +34,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MOST = 1e9
+_LONGEST_PATH = 4096
 
 
 def read_transforms(path: Path) -> SparseModel:
@@ -41,14 +46,11 @@ def read_transforms(path: Path) -> SparseModel:
     Raises:
         SceneError: Names the frame and the key that is wrong.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        frames = content["frames"]
-        if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
-            raise TypeError("frames is not a list of mappings")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        what = f"content must be a JSON with frames, got {type(error).__name__}: {error}"
-        raise SceneError(Fault(str(path), what)) from error
+    content = read_json(path, "a JSON with frames")
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
+        what = "content must be a JSON with frames, a list of mappings, got none"
+        raise SceneError(Fault(str(path), what))
     unturn, scale = _applied(path, content)
     names = [_name(path, number, frame) for number, frame in enumerate(frames)]
     shared = _shared_folder(names)
@@ -56,7 +58,7 @@ def read_transforms(path: Path) -> SparseModel:
     images = []
     for number, (frame, name) in enumerate(zip(frames, names, strict=True)):
         where = f"frame {number}"
-        lens = _lens(path, where, {**content, **frame}, path.parent / name)
+        lens = _lens(path, where, ChainMap(frame, content), path.parent / name)
         camera = cameras.setdefault(lens, SparseCamera(len(cameras) + 1, *lens))
         pose = _matrix(path, where, frame.get("transform_matrix"))
         pose[:3, 3] /= scale
@@ -124,18 +126,19 @@ def write_transforms(path: Path, model: SparseModel, images: str = "images") -> 
 
 def _name(path: Path, number: int, frame: Mapping[str, Any]) -> PurePosixPath:
     name = frame.get("file_path")
-    if not isinstance(name, str) or not name.strip():
-        what = f"file_path must be the path of an image, got {name!r}"
+    if not isinstance(name, str) or not name.strip() or len(name) > _LONGEST_PATH or "\0" in name:
+        what = f"file_path must be the path of an image, got {str(name)[:80]!r}"
         raise SceneError(Fault(str(path), what, where=f"frame {number}"))
     return PurePosixPath(name.replace("\\", "/"))
 
 
 def _shared_folder(names: list[PurePosixPath]) -> PurePosixPath:
     """Deepest folder that holds them all."""
-    shared = names[0].parent if names else PurePosixPath()
-    while not all(name.is_relative_to(shared) for name in names):
-        shared = shared.parent
-    return shared
+    folders = [name.parent.parts for name in names]
+    # What the first and the last in order share, all share.
+    first, last = (min(folders), max(folders)) if folders else ((), ())
+    shared = takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))
+    return PurePosixPath(*(part for part, _ in shared))
 
 
 def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Float64[np.ndarray, "4 4"], float]:
@@ -210,15 +213,12 @@ def _number(path: Path, where: str, value: Any, least: float = -_MOST) -> float:
 
 
 def _image_size(path: Path, where: str, image: Path) -> tuple[int, int]:
-    found = (
-        image
-        if image.is_file()
-        else next(iter(sorted(image.parent.glob(f"{image.name}.*"))), image)
-    )
     try:
-        with Image.open(found) as opened:
+        named = f"{glob.escape(image.name)}.*"
+        found = image if image.is_file() else next(iter(sorted(image.parent.glob(named))), image)
+        with picture(found) as opened:
             return opened.size
-    except UNREADABLE as error:
+    except (ValueError, OSError) as error:
         what = f"w and h must be given or {image} must be an image, got {error}"
         raise SceneError(Fault(str(path), what, where=where)) from error
 
@@ -230,14 +230,15 @@ def _read_points(
     if name is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     file = path.parent / str(name)
+    expected = "ply_file_path must be a PLY with x y z red green blue"
     try:
-        vertices = PlyData.read(str(file))["vertex"].data
+        vertices = read_vertices(file)
+        with np.errstate(invalid="ignore"):  # NaN is no colour; it becomes some
+            channels = [vertices[name].astype(np.uint8) for name in ("red", "green", "blue")]
         points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-        channels = [vertices[name].astype(np.uint8) for name in ("red", "green", "blue")]
-    except (OSError, PlyParseError, UnicodeDecodeError, ValueError, KeyError, MemoryError) as error:
-        what = "ply_file_path must be a PLY with x y z red green blue"
+    except (OSError, KeyError) as error:
         raise SceneError(
-            Fault(str(file), f"{what}, got {type(error).__name__}: {error}")
+            Fault(str(file), f"{expected}, got {type(error).__name__}: {error}")
         ) from error
     return points, np.stack(channels, axis=1)
 

@@ -3,7 +3,6 @@
 import functools
 import io
 import logging
-import zipfile
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from vlgs.data.synthetic.masks import NO_FAULTS, Region
 from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.recipe import Recipe
 from vlgs.data.synthetic.world import World
+from vlgs.data.untrusted.arrays import Archive
 from vlgs.files import write_atomically
 from vlgs.types import Camera
 
@@ -93,12 +93,12 @@ def _photographs(
     file = cache / f"studio-{recipe.fingerprint(level=0)}.npz"
     names = [field.name for field in fields(Photograph)]
     try:
-        with file.open("rb") as raw, np.load(raw) as kept:
-            stacks = [kept[name] for name in names]
+        with Archive(file, "photographs of the scene") as kept:
+            stacks = [kept.read(name, "fiub") for name in names]
         return [Photograph(*arrays) for arrays in zip(*stacks, strict=True)]
     except FileNotFoundError:
         pass
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
     photos = [photograph(world, camera) for camera in cameras]
     content = io.BytesIO()
