@@ -7,14 +7,15 @@ from dataclasses import dataclass
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
 from rich.console import Console
 from torch import Tensor
 
-from vlgs.config import CONF, LEVELS, check_targets, instantiate
+from vlgs.command import check_command
+from vlgs.config import CONF, LEVELS, check_config, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
 from vlgs.data.plausible import plausibility_warnings
+from vlgs.prepare import doubts, prepare, rehearse
 from vlgs.types import IGNORE_ID, Scene, View
 
 _COLMAP = "vlgs.data.colmap.load_scene"
@@ -32,18 +33,41 @@ class Report:
 def main(config: DictConfig) -> None:
     """Print the report; see the module."""
     try:
-        check_targets(config)
+        check_config(config)
         report = check(config.data)
         if not errors(report.faults):
             line, doubts = training_memory(config)
-            report = Report((*report.faults, *doubts), (*report.summary, line))
-    except MissingMandatoryValue as error:
-        sys.exit(f"error: {error.full_key} must be given")
+            faults = (*report.faults, *doubts, *start(config))
+            report = Report(faults, (*report.summary, line))
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     print_report(report)
     if errors(report.faults):
         sys.exit(1)
+
+
+def command() -> None:
+    """The command line, from reading it to the exit status."""
+    try:
+        check_command(sys.argv[1:])
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    if {"--help", "-h"} & set(sys.argv):
+        sys.argv.append("hydra/help=check")
+    main()
+
+
+def start(config: DictConfig) -> Iterator[Fault]:
+    """Begin the run: what it would end with at once is an error here."""
+    try:
+        scenes = prepare(config).scenes
+        yield from doubts(config)
+        rehearse(config, scenes)
+    except SceneError as error:
+        yield error.fault
+    except (ValueError, OSError, FloatingPointError) as error:
+        who, _, what = str(error).partition(": ")
+        yield Fault(who, what)
 
 
 def check(data: DictConfig) -> Report:
@@ -184,6 +208,4 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Sequence[Tensor]]]]
 
 
 if __name__ == "__main__":
-    if {"--help", "-h"} & set(sys.argv):
-        sys.argv.append("hydra/help=check")
-    main()
+    command()

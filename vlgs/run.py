@@ -4,7 +4,9 @@ import logging
 import os
 import resource
 import sys
-from dataclasses import asdict, fields
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +15,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import (
-    CONF,
-    GIVEN_FILES,
-    LEVELS,
-    RESULTS_VERSION,
-    check_config,
-    identity,
-    instantiate,
-    run_id,
-)
+from vlgs.command import check_command
+from vlgs.config import CONF, RESULTS_VERSION, identity, instantiate
+from vlgs.prepare import Scenes, doubts, make_stages, prepare, text_encoder
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 
 log = logging.getLogger(__name__)
@@ -48,51 +43,61 @@ def main(config: DictConfig) -> None:
         sys.exit(status)
 
 
+def command() -> None:
+    """The command line, from reading it to the exit status."""
+    try:
+        check_command(sys.argv[1:])
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    main()
+
+
 def run(config: DictConfig) -> int:
     """Do one run or take up one that was left; see `main`.
 
     Returns:
         The exit status: 0 when the results are there, else `STOPPED` or `UNSCORED`.
     """
-    check_config(config)
-    import torch
-
-    from vlgs.interchange import file_digest
-
-    torch.set_num_threads(config.threads)
-    scenes = _scenes(config)
-    given = {key: config[group].get(key) for group, key in GIVEN_FILES}
-    augment = instantiate(config.augment)
-    augment.require(scenes)
-    read = [*(scene.fingerprint for scene in scenes.values()), augment.identity()]
-    read += [file_digest(path, key) for key, path in given.items() if path]
-    content = " ".join(filter(None, read))
-    folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
+    ready = prepare(config)
+    folder = RunFolder(Path(config.results) / "runs" / ready.run_id)
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
         )
-    with folder.writing():
-        return _run_in(folder, config, scenes)
+    with folder.writing(), _removed_if_refused(folder):
+        return _run_in(folder, config, ready.scenes)
 
 
-def _scenes(config: DictConfig) -> dict[int | None, Any]:
-    """Mask level -> scene; the last one, of whole objects where there are several, stands for what they share."""
-    if config.levels == "single":
-        return {config.data.get("level"): instantiate(config.data)}
-    return {level: instantiate(config.data, level=level) for level in LEVELS}
+@contextmanager
+def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
+    """Leave nothing of a run that is refused before its first iteration."""
+    try:
+        yield
+    except (ValueError, OSError):
+        begun = {".lock", folder.config.name}
+        if all(path.name in begun for path in folder.path.iterdir()):
+            for path in folder.path.iterdir():
+                path.unlink()
+            for path in (folder.path, *folder.path.parents[:2]):
+                if not any(path.iterdir()):
+                    path.rmdir()
+        raise
 
 
-def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> int:
+def _run_in(folder: RunFolder, config: DictConfig, scenes: Scenes) -> int:
     finished = folder.finished()
     if finished is not None:
         log.info("this run exists: %s (nothing was computed)", folder.path)
         return _say(finished, folder)
+    from vlgs.data.plausible import plausibility_warnings
     from vlgs.module.stages import StoppedError, train_all
 
-    text = _text_encoder(config, next(reversed(scenes.values())))
+    scene = next(reversed(scenes.values()))
+    for doubt in (*doubts(config), *plausibility_warnings(scene, (*scene.train, *scene.test))):
+        log.warning("warning: %s", doubt)
+    text = text_encoder(config, scene)
     folder.config.write_text(OmegaConf.to_yaml(config, resolve=True))
-    stages = _stages(folder, config, scenes)
+    stages = make_stages(folder, config, scenes)
     try:
         sharing, augment = instantiate(config.sharing), instantiate(config.augment)
         models = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
@@ -110,53 +115,10 @@ def _say(metrics: dict[str, Any], folder: RunFolder) -> int:
     return UNSCORED if metrics.get("failure") else 0
 
 
-def _text_encoder(config: DictConfig, scene: Any) -> Any:
-    """What turns the scene's classes into vectors; None where nothing can be asked.
-
-    A word that it does not know is an error now, not after training.
-    """
-    from vlgs.query import encode_prompts
-    from vlgs.query.text import VocabularyText
-
-    if not scene.classes or scene.mask_vectors.shape[0] == 0:
-        return None
-    text = instantiate(config.text)(vocabulary=scene.vocabulary)
-    if isinstance(text, VocabularyText) and scene.vocabulary is None:
-        log.warning(
-            "no vocabulary: language is trained but not scored (data.vocabulary=FILE or text=clip)"
-        )
-        return None
-    encode_prompts(instantiate(config.query), text, scene.classes)
-    return text
-
-
-def _stages(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> Any:
-    import torch
-
-    from vlgs.module.build import Parts
-    from vlgs.module.fit import FitOptions
-    from vlgs.module.stages import Stages
-
-    def make_parts() -> Parts:
-        # Initial weights of the fusion come from the global generator; every other draw has one of its own.
-        torch.manual_seed(config.seed)
-        return Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
-
-    def make_options() -> FitOptions:
-        meta = {
-            "config": OmegaConf.to_container(config, resolve=True),
-            "fingerprint": " ".join(scene.fingerprint for scene in scenes.values()),
-        }
-        loggers = [instantiate(logger) for logger in config.logger.loggers]
-        return FitOptions(meta=meta, progress=config.progress, loggers=loggers)
-
-    return Stages(folder, make_parts, make_options, config.seed)
-
-
 def _report(
     folder: RunFolder,
     config: DictConfig,
-    scenes: dict[int | None, Any],
+    scenes: Scenes,
     models: list[Any],
     stages: Any,
     text: Any,
@@ -230,4 +192,4 @@ def _command() -> str:
 
 
 if __name__ == "__main__":
-    main()
+    command()

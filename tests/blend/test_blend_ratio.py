@@ -92,7 +92,7 @@ def test_option_is_the_default_of_its_class(option: str, want: ViewBlend):
 @pytest.mark.parametrize(
     ("build", "arguments", "message"),
     [
-        (BetaBlend, {"alpha": 0.0}, "BetaBlend: alpha must be positive and finite, got 0.0"),
+        (BetaBlend, {"alpha": 0.0}, "BetaBlend: alpha must be 0.001 to 1e+06, got 0.0"),
         (BetaBlend, {"alpha": math.nan}, "alpha must be positive"),
         (FixedBlend, {"value": 1.5}, r"FixedBlend: value must be in \[0, 1\], got 1.5"),
         (GaussianBlend, {"std": -1.0}, "std >= 0, got 0.0, -1.0"),

@@ -19,7 +19,9 @@ def families() -> list[str]:
     """Names of the families, each a module of this folder."""
     names = (module.name for module in pkgutil.iter_modules(fuzz.__path__))
     return sorted(
-        name for name in names if name not in ("judge", "__main__") and not name.startswith("test_")
+        name
+        for name in names
+        if name not in ("judge", "commands", "__main__") and not name.startswith("test_")
     )
 
 
