@@ -52,6 +52,11 @@ def check_command(arguments: Sequence[str], name: str = "config") -> None:
         _check_folder(extra)
     overrides = _parse(given.overrides)
     _check_overrides(overrides, extra)
+    for override in overrides:
+        if override.is_sweep_override() and not given.multirun:
+            raise ValueError(
+                f"command: several values must be given with -m, one run for each; a list in brackets, a text in quotes, got {override.input_line}"
+            )
     if given.help and (chosen := [o for o in overrides if o.key_or_group in groups()]):
         for override in chosen:
             print(describe(override.key_or_group, str(override.value())))

@@ -139,7 +139,9 @@ def _check_root(config: DictConfig) -> None:
     if not config.results:
         raise ValueError("config: results must be a folder, got ''")
     loggers = config.logger.get("loggers")
-    if not isinstance(loggers, ListConfig) or not all("_target_" in one for one in loggers):
+    if not isinstance(loggers, ListConfig) or not all(
+        isinstance(one, DictConfig) and "_target_" in one for one in loggers
+    ):
         raise ValueError(f"config: logger.loggers must be a list of loggers, got {loggers}")
 
 

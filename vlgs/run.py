@@ -26,7 +26,12 @@ log = logging.getLogger(__name__)
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
     """One run; in a multirun Hydra calls this once per combination."""
-    alone = HydraConfig.get().mode == RunMode.RUN and "HYDRA_FULL_ERROR" not in os.environ
+    hydra_config = HydraConfig.get()
+    here = str(hydra_config.launcher._target_).endswith(
+        ".BasicLauncher"
+    )  # one after the other, in this process
+    alone = here or hydra_config.mode == RunMode.RUN
+    alone = alone and "HYDRA_FULL_ERROR" not in os.environ
     try:
         status = run(config)
     except (ValueError, OSError, FloatingPointError) as error:

@@ -7,6 +7,7 @@ comes before any training and leaves no run.
 import random
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -53,7 +54,7 @@ WRONG = (
     ("fusion=", "self"),
     ("fusion=null", "none"),
     ("fusion=[self]", "self"),
-    ("fusion=none,self", ""),
+    ("fusion=none,self", "-m"),
     ("fusion.widht=3", "fusion.width"),
     ("fusion.width=none", "whole number"),
     ("fusion", "KEY=VALUE"),
@@ -104,7 +105,7 @@ WRONG = (
     ("data=colmap data.root=nowhere", "nowhere"),
     ("data=colmap data.root=2024", "root"),
     ("data=lerf_ovs", "data.root"),
-    ("data=lerf_ovs data.root=nowhere", "data.scene"),
+    ("data=lerf_ovs data.root=nowhere", "nowhere"),
     ("data=lerf_ovs data.root=nowhere data.scene=ramen", "nowhere"),
     ("data=mipnerf360_goi data.root=x data.scene=garden", "data.release.labels"),
     ("data=mipnerf360 data.root=x data.scene=nowhere", "data.images"),
@@ -244,7 +245,7 @@ def _tiny(arguments: list[str]) -> list[str]:
 
 def _attack(folder: Path, arguments: list[str], named: str, must_refuse: bool) -> Attack:
     def call() -> None:
-        outcome(_tiny(arguments), folder)
+        outcome(_tiny(arguments), Path(mkdtemp(dir=folder)) / "here")
 
     return Attack(" ".join(arguments), call, must_say=named, must_refuse=must_refuse)
 
@@ -252,7 +253,7 @@ def _attack(folder: Path, arguments: list[str], named: str, must_refuse: bool) -
 def _accepted(folder: Path, arguments: list[str]) -> Attack:
     def call() -> None:
         try:
-            outcome(_tiny(arguments), folder)
+            outcome(_tiny(arguments), Path(mkdtemp(dir=folder)) / "here")
         except ValueError as error:
             raise AssertionError(f"refused: {error}") from error
 

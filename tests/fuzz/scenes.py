@@ -18,7 +18,7 @@ from vlgs.command import check_command
 NEGATIVES = ("object", "things", "stuff", "texture")
 OPTIONS = (
     *("data=colmap", "data.every=3", "codec.cache_dir=null", "codec.training.steps=2", "threads=1"),
-    *("trainer=smoke", "trainer.iterations=2", "progress=false"),
+    *("trainer=smoke", "trainer.iterations=2", "progress=false", "pictures=false"),
 )
 
 
@@ -253,7 +253,8 @@ def _write_words(root: Path, scene: Odd) -> None:
             ids[: height // 2] = 1
         if scene.labels == "objects":
             corners = [[0, 0], [width / 2, 0], [width / 2, height / 2], [0, height / 2]]
-            shapes = [{"category": c, "segmentation": corners} for c in scene.classes]
+            box = [0, 0, width / 2, height / 2]
+            shapes = [{"category": c, "segmentation": corners, "bbox": box} for c in scene.classes]
             info = {"name": f"{stem}.png", "width": width, "height": height}
             (root / "labels" / f"{stem}.json").write_text(
                 json.dumps({"info": info, "objects": shapes})
