@@ -18,6 +18,9 @@ log = logging.getLogger(__name__)
 Scenes = dict[int | None, Any]
 """Mask level -> scene; the last one, of whole objects where there are several, stands for what they share."""
 
+_LEAST = 6
+"""Pixels on a side that `vlgs.metrics.image.ssim` asks for."""
+
 _STEPS = 2
 """Of a rehearsal: the second is the first that comes after a change of the parameters."""
 
@@ -50,6 +53,7 @@ def prepare(config: DictConfig) -> Prepared:
     given = {key: config[group].get(key) for group, key in GIVEN_FILES}
     augment = instantiate(config.augment)
     scenes = _scenes(config)
+    _require_sizes(next(reversed(scenes.values())))
     augment.require(scenes)
     content = [*(scene.fingerprint for scene in scenes.values()), augment.identity()]
     content += [file_digest(path, key) for key, path in given.items() if path]
@@ -108,7 +112,7 @@ def make_stages(folder: Any, config: DictConfig, scenes: Scenes) -> Any:
 
 
 def rehearse(config: DictConfig, scenes: Scenes) -> None:
-    """Begin a run in a folder that is thrown away: encode the words, build every model and train each for two steps.
+    """Begin a run in a folder that is thrown away: encode the words, build every model, train each for two steps, score a view.
 
     Raises:
         ValueError: What the run would end with.
@@ -120,9 +124,11 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
     from vlgs.module.build import Parts
     from vlgs.module.fit import FitOptions
     from vlgs.module.stages import Stages, train_all
+    from vlgs.report.evaluate import evaluate
     from vlgs.runs import RunFolder
 
-    text_encoder(config, next(reversed(scenes.values())))
+    scene = next(reversed(scenes.values()))
+    text = text_encoder(config, scene)
     for logger in config.logger.loggers:
         instantiate(logger)
 
@@ -138,7 +144,9 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
         options = FitOptions(meta={}, progress=False)
         stages = Stages(RunFolder(Path(scratch)), make_parts, lambda: options, config.seed)
         joint = config.levels == "joint"
-        train_all(stages, scenes, instantiate(config.sharing), NoAugment(), joint=joint)
+        models = train_all(stages, scenes, instantiate(config.sharing), NoAugment(), joint=joint)
+    query, protocol = instantiate(config.query), instantiate(config.protocol)
+    evaluate(models, replace(scene, test=scene.test[:1]), query, text, protocol)
 
 
 def _make_parts(config: DictConfig) -> Any:
@@ -149,6 +157,17 @@ def _make_parts(config: DictConfig) -> Any:
     # Initial weights of the fusion come from the global generator; every other draw has one of its own.
     torch.manual_seed(config.seed)
     return Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+
+
+def _require_sizes(scene: Any) -> None:
+    """Refuse held-out views that no score can be given to."""
+    for view in scene.test:
+        width, height = view.camera.width, view.camera.height
+        if min(width, height) < _LEAST:
+            raise ValueError(
+                f"{view.name}: held-out views must be at least {_LEAST} x {_LEAST} pixels, as SSIM's window mirrors half of "
+                f"itself, got {width} x {height}"
+            )
 
 
 def _scenes(config: DictConfig) -> Scenes:

@@ -3,7 +3,7 @@
 import math
 import types
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _LARGEST = 2**63 - 1
@@ -79,7 +79,7 @@ def _fits(hint: Any, value: Any) -> bool:
             and abs(value) <= _LARGEST
             and math.isfinite(value)
         )
-    return True
+    return isinstance(value, hint) if is_dataclass(hint) and isinstance(hint, type) else True
 
 
 def _is_list(value: Any) -> bool:
@@ -99,6 +99,8 @@ def _words(hint: Any) -> str:
         return " or ".join(map(str, get_args(hint)))
     if get_origin(hint) in (Sequence, list, tuple, Iterable):
         return f"a list, each {_words((get_args(hint) or (Any,))[0])}"
+    if is_dataclass(hint) and isinstance(hint, type):
+        return f"the settings of a {hint.__name__}"
     names = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text"}
     names |= {type(None): "null", Any: "anything"}
     return names.get(hint, "a mapping" if get_origin(hint) is Mapping else str(hint))
