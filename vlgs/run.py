@@ -27,10 +27,8 @@ log = logging.getLogger(__name__)
 def main(config: DictConfig) -> None:
     """One run; in a multirun Hydra calls this once per combination."""
     hydra_config = HydraConfig.get()
-    here = str(hydra_config.launcher._target_).endswith(
-        ".BasicLauncher"
-    )  # one after the other, in this process
-    alone = here or hydra_config.mode == RunMode.RUN
+    basic = str(hydra_config.launcher._target_).endswith(".BasicLauncher")  # all in this process
+    alone = basic or hydra_config.mode == RunMode.RUN
     alone = alone and "HYDRA_FULL_ERROR" not in os.environ
     try:
         status = run(config)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from vlgs.known import is_ours, join, last, nodes, targets
+from vlgs.known import join, last, nodes, targets
 
 _NOT_PLUGINS = frozenset(sys.stdlib_module_names) | {
     *("vlgs", "torch", "lightning", "pytorch_lightning", "hydra", "hydra_plugins", "omegaconf"),
@@ -138,6 +138,3 @@ def _is_name(target: object) -> bool:
     """Whether a target is a plain dotted name: a module and what is in it, nothing hidden."""
     parts = target.split(".") if isinstance(target, str) else []
     return len(parts) > 1 and all(p.isidentifier() and not p.startswith("_") for p in parts)
-
-
-__all__ = ["check_hydra", "check_targets", "is_ours", "require_home", "require_plugins"]
