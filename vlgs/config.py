@@ -195,7 +195,9 @@ def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, A
         ) from error
     plain = {k: v for k, v in values.items() if not (isinstance(v, Mapping) and "_target_" in v)}
     hints = typing.get_type_hints(made.__init__ if isinstance(made, type) else made)
-    require_types(who, hints, plain)
+    # Constructors know their choices, and say them in words of theirs.
+    judged = {k: h for k, h in hints.items() if typing.get_origin(h) is not Literal}
+    require_types(who, judged, plain)
 
 
 def _who(config: Any, key: str, target: str) -> str:

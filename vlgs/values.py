@@ -30,7 +30,9 @@ def require_types(who: str, hints: Mapping[str, Any], values: Mapping[str, Any])
         hint = hints.get(name, Any)
         if not _fits(hint, value):
             quote = f"; quote it: \"'{value}'\"" if _wants_text(hint, value) else ""
-            raise ValueError(f"{who}: {name} must be {_words(hint)}, got {value!r}{quote}")
+            raise ValueError(
+                f"{who}: {name} must be {_words(hint)}, got {value or repr(value)}{quote}"
+            )
 
 
 def require_fields(who: str, given: Any) -> None:
