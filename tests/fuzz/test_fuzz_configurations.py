@@ -9,13 +9,13 @@ from vlgs.command import check_command
 
 REFUSED = {
     "trainer.iterations=0": "iterations must be 1 to 1e+09, got 0",
-    "trainer.learning_rates.means=-1": "learning_rates: means must be 0 to 1, got -1",
+    "trainer.learning_rates.means=-1.0": "learning_rates: means must be 0 to 1, got -1.0",
     "seed=18446744073709551616": "config: seed must be a whole number",
     "threads=100000": "config: threads must be 1 to 256, got 100000",
     "blend.alpha=nan": "blend: alpha must be a finite number, got nan",
     "gaussians.densify=null": "gaussians: densify must be",
     "query.negatives=[unheard]": "query: the text encoder must know the negatives unheard",
-    "raster.alpha_max=1": "RasterConfig: alpha_max must be below 1",
+    "raster.alpha_max=1.0": "RasterConfig: alpha_max must be below 1",
 }
 AT_ONCE = {
     "trainr=photos": "trainr must be a key, got one that is not there; did you mean trainer?",
