@@ -8,15 +8,16 @@ from dataclasses import dataclass
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
 from rich.console import Console
 from torch import Tensor
 
 from vlgs.arguments import take_command_line
-from vlgs.config import CONF, LEVELS, check_targets, instantiate
+from vlgs.command import check_command
+from vlgs.config import CONF, LEVELS, check_config, instantiate
 from vlgs.data.colmap import ColmapSource, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
 from vlgs.data.plausible import plausibility_warnings
+from vlgs.prepare import doubts, prepare, rehearse
 from vlgs.text import screen
 from vlgs.types import IGNORE_ID, Scene, View
 
@@ -37,18 +38,42 @@ def main(config: DictConfig) -> None:
     # What it would say of its warnings while it loads a scene stands in the report.
     logging.getLogger("vlgs.data.colmap").setLevel(logging.ERROR)
     try:
-        check_targets(config)
+        check_config(config)
         report = check(config.data)
         if not errors(report.faults):
             line, doubts = training_memory(config)
-            report = Report((*report.faults, *doubts), (*report.summary, line))
-    except MissingMandatoryValue as error:
-        sys.exit(f"error: {error.full_key} must be given")
+            faults = (*report.faults, *doubts, *start(config))
+            report = Report(faults, (*report.summary, line))
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     print_report(report)
     if errors(report.faults):
         sys.exit(1)
+
+
+def command() -> None:
+    """The command line, from reading it to the exit status."""
+    take_command_line()
+    try:
+        check_command(sys.argv[1:])
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    if {"--help", "-h"} & set(sys.argv):
+        sys.argv.append("hydra/help=check")
+    main()
+
+
+def start(config: DictConfig) -> Iterator[Fault]:
+    """Begin the run: what it would end with at once is an error here."""
+    try:
+        scenes = prepare(config).scenes
+        yield from doubts(config)
+        rehearse(config, scenes)
+    except SceneError as error:
+        yield error.fault
+    except (ValueError, OSError, FloatingPointError) as error:
+        who, _, what = str(error).partition(": ")
+        yield Fault(who, what)
 
 
 def check(data: DictConfig) -> Report:
@@ -187,7 +212,4 @@ def _readers(view: View) -> Iterator[tuple[str, Callable[[], Iterable[Tensor]]]]
 
 
 if __name__ == "__main__":
-    if {"--help", "-h"} & set(sys.argv):
-        sys.argv.append("hydra/help=check")
-    take_command_line()
-    main()
+    command()

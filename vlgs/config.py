@@ -1,23 +1,22 @@
 """The configuration: where it lives, what it may construct, and which run it names. Imports no torch."""
 
 import hashlib
-import importlib.resources
+import inspect
 import json
 import re
-from collections.abc import Iterator
+import typing
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-_CHECKOUT = Path(__file__).resolve().parents[1]
-_PACKAGE = Path(str(importlib.resources.files("vlgs")))
-CONF = _CHECKOUT / "conf" if (_CHECKOUT / "conf" / "config.yaml").is_file() else _PACKAGE / "conf"
-"""Folder of the configuration: beside the package in a checkout, inside it in an installed wheel."""
-
-TRUSTED_PACKAGES = ("vlgs", "torch", "lightning")
-"""Packages that a `_target_` may name; `plugins` in the configuration adds more."""
+from vlgs import targets
+from vlgs.known import CONF as CONF
+from vlgs.known import is_ours, join, last, nodes, unread
+from vlgs.values import require_range, require_types
 
 NOT_PART_OF_A_RUN = frozenset(
     {
@@ -49,6 +48,9 @@ _NO_FUSION = "vlgs.fusion.none.NoFusion"
 _PER_LEVEL = "vlgs.indicator.PerLevel"
 _NOT_LEARNED = ("vlgs.indicator.ColourOpacity", "vlgs.indicator.Fixed")
 
+MOST_THREADS = 256
+"""More than that no machine of one process has, and starting them fails half-way."""
+
 GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
@@ -59,17 +61,14 @@ def check_config(config: DictConfig) -> None:
     Raises:
         ValueError: Names the key, what it must be and what it is.
     """
-    missing = sorted(OmegaConf.missing_keys(config))
+    try:
+        missing = sorted(OmegaConf.missing_keys(config))
+    except OmegaConfBaseException as error:
+        raise _unresolved(error) from error
     if missing:
         raise ValueError(f"config: {missing[0]} must be given, as {missing[0]}=VALUE; got nothing")
-    for key, least in (("seed", 0), ("threads", 1)):
-        value = config[key]
-        if not isinstance(value, int) or value < least:
-            raise ValueError(f"config: {key} must be an integer of at least {least}, got {value}")
-    if config.on_existing not in ("resume", "refuse"):
-        raise ValueError(f"config: on_existing must be resume or refuse, got {config.on_existing}")
-    if config.levels not in ("single", "separate", "joint"):
-        raise ValueError(f"config: levels must be single, separate or joint, got {config.levels}")
+    check_targets(config)
+    _check_root(config)
     if config.levels != "single" and "level" not in config.data:
         raise ValueError(
             f"config: data must have mask levels with levels={config.levels}, got no data.level"
@@ -79,10 +78,10 @@ def check_config(config: DictConfig) -> None:
             f"config: levels must be joint with indicator=per_level, got {config.levels}"
         )
     if config.sharing.get("lifted", False):
-        for group, targets in (("fusion", (_NO_FUSION,)), ("indicator", _NOT_LEARNED)):
-            if config[group]._target_ not in targets:
+        for group, allowed in (("fusion", (_NO_FUSION,)), ("indicator", _NOT_LEARNED)):
+            if config[group]._target_ not in allowed:
                 raise ValueError(
-                    f"config: {group} must be {' or '.join(targets)} with sharing=lifted, as nothing trains it, "
+                    f"config: {group} must be {' or '.join(allowed)} with sharing=lifted, as nothing trains it, "
                     f"got {config[group]._target_}"
                 )
     if not config.sharing.get("means", True) and config.fusion._target_ != _NO_FUSION:
@@ -90,51 +89,121 @@ def check_config(config: DictConfig) -> None:
             "config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, "
             f"got {config.fusion._target_}"
         )
-    check_targets(config)
 
 
-def check_targets(config: DictConfig) -> None:
-    """Refuse a configuration that would construct something outside the trusted packages.
+def check_targets(
+    config: DictConfig, name: str = "config", plugins: Sequence[str] | None = None
+) -> None:
+    """Refuse a configuration with keys that nothing reads, or that would construct something that is neither ours nor trusted.
+
+    Args:
+        config: Composed.
+        name: Of the file in `conf` that it was composed from.
+        plugins: Packages that are trusted; by default those that the configuration names, which must then come from a command line.
 
     Raises:
-        ValueError: Names the key, the target and how to allow it.
+        ValueError: Names the key, and what could have been meant or how to allow it.
     """
-    trusted = (*TRUSTED_PACKAGES, *config.get("plugins", []))
-    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    for key, target in _targets(plain, ""):
-        package = str(target).partition(".")[0]
-        if package not in trusted or not all(
-            part.isidentifier() for part in str(target).split(".")
-        ):
-            raise ValueError(
-                f"config: {key} must name something in {', '.join(trusted)}, got {target}; "
-                f"if you trust it, add its package: plugins=[{package}]"
-            )
+    try:
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    except OmegaConfBaseException as error:
+        raise _unresolved(error) from error
+    assert isinstance(plain, dict)
+    plain = {str(key): value for key, value in plain.items() if key != "hydra"}
+    for key, meant in unread(plain, name):
+        hint = f"; did you mean {' or '.join(meant)}?" if meant else ""
+        raise ValueError(
+            f"config: {key} must be a key that is read, got one that nothing reads{hint}"
+        )
+    targets.check_targets(plain, plain.get("plugins", []) if plugins is None else plugins)
+
+
+def _unresolved(error: OmegaConfBaseException) -> ValueError:
+    reason = str(error).strip().partition("\n")[0]
+    return ValueError(f"config: {error.full_key} must have a value, got: {reason}")
+
+
+def _check_root(config: DictConfig) -> None:
+    """The keys of the root, which no constructor looks at."""
+    hints = {
+        "seed": int,
+        "threads": int,
+        "progress": bool,
+        "pictures": bool,
+        "results": str,
+        "on_existing": Literal["resume", "refuse"],
+        "levels": Literal["single", "separate", "joint"],
+    }
+    require_types("config", hints, {key: config.get(key) for key in hints})
+    require_range("config", 0, 2**63 - 1, seed=config.seed)
+    require_range("config", 1, MOST_THREADS, threads=config.threads)
+    if not config.results:
+        raise ValueError("config: results must be a folder, got ''")
+    loggers = config.logger.get("loggers")
+    if not isinstance(loggers, ListConfig) or not all(
+        isinstance(one, DictConfig) and "_target_" in one for one in loggers
+    ):
+        raise ValueError(f"config: logger.loggers must be a list of loggers, got {loggers}")
 
 
 def instantiate(config: Any, **arguments: Any) -> Any:
-    """Construct what a `_target_` names, and check that it really comes from where its name says.
+    """Construct what a `_target_` names; its arguments have the types that it asks for, and a plugin's part is really a plugin's.
 
     Raises:
-        ValueError: If the resolved object lives outside the package that was named (`vlgs.data.os.system`), or its own
-            error about a bad value, without Hydra's wrapping.
+        ValueError: If a name is neither ours nor that of something in a plugin (`vlgs.data.os.system`), an argument is missing or has
+            another type, or the constructor says so itself, without Hydra's wrapping.
         OSError: Likewise.
     """
     from hydra.errors import InstantiationException
     from hydra.utils import get_object, instantiate
 
-    for key, target in _targets(OmegaConf.to_container(config, resolve=True), ""):
-        home = getattr(get_object(str(target)), "__module__", "") or ""
-        if home.partition(".")[0] != str(target).partition(".")[0]:
-            raise ValueError(
-                f"config: {key} must come from its own package, got {target}, which is from {home}"
-            )
+    plain = OmegaConf.to_container(config, resolve=True)
+    for key, node in nodes(plain):
+        if "_target_" in node:
+            name, target = join(key, "_target_"), str(node["_target_"])
+            try:
+                if not is_ours(target):
+                    targets.require_home(name, target, get_object)
+                made = get_object(target)
+            except (ImportError, InstantiationException) as error:
+                raise ValueError(
+                    f"config: {name} must be there and installed, got {target}: {error}"
+                ) from error
+            given = dict(node) | (arguments if not key else {})
+            _require_arguments(_who(config, key, target), made, given)
     try:
         return instantiate(config, **arguments)
     except InstantiationException as error:
         if isinstance(error.__cause__, (ValueError, OSError)):
             raise error.__cause__ from None
+        if isinstance(error.__cause__, ModuleNotFoundError):
+            package = error.__cause__.name
+            raise ValueError(
+                f"config: {config._target_} must be installed, got no {package}"
+            ) from error
         raise
+
+
+def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, Any]) -> None:
+    """Hold arguments against a constructor's signature; parts that stand in them are judged by themselves."""
+    values = {k: v for k, v in given.items() if k not in ("_target_", "_partial_")}
+    signature = inspect.signature(made)
+    try:
+        (signature.bind_partial if given.get("_partial_") else signature.bind)(**values)
+    except TypeError as error:
+        raise ValueError(
+            f"{who}: arguments must be those of {made.__name__}, got {error}"
+        ) from error
+    plain = {k: v for k, v in values.items() if not (isinstance(v, Mapping) and "_target_" in v)}
+    hints = typing.get_type_hints(made.__init__ if isinstance(made, type) else made)
+    # Constructors know their choices, and say them in words of theirs.
+    judged = {k: h for k, h in hints.items() if typing.get_origin(h) is not Literal}
+    require_types(who, judged, plain)
+
+
+def _who(config: Any, key: str, target: str) -> str:
+    """The group in whose name a part speaks: that of its key, else its own."""
+    return last(key) or last(str(config._get_full_key(None) or "")) or target.rpartition(".")[2]
 
 
 RESULTS_VERSION = 2
@@ -256,15 +325,3 @@ def _digest(content: dict[str, Any]) -> str:
     content = content | {"results_version": RESULTS_VERSION}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-
-
-def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(node, dict):
-        for name, child in node.items():
-            if name == "_target_":
-                yield f"{key}._target_".lstrip("."), child
-            else:
-                yield from _targets(child, f"{key}.{name}")
-    elif isinstance(node, list):
-        for index, child in enumerate(node):
-            yield from _targets(child, f"{key}.{index}")

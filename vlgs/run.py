@@ -4,7 +4,9 @@ import logging
 import os
 import resource
 import sys
-from dataclasses import asdict, fields, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +16,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from vlgs.arguments import command_line, take_command_line
-from vlgs.config import (
-    CONF,
-    GIVEN_FILES,
-    LEVELS,
-    RESULTS_VERSION,
-    check_config,
-    identity,
-    instantiate,
-    run_id,
-)
-from vlgs.places import record, tidy_sweep, write_config
+from vlgs.command import check_command
+from vlgs.config import CONF, RESULTS_VERSION, identity, instantiate
+from vlgs.places import tidy_sweep, write_config
+from vlgs.prepare import Scenes, doubts, make_stages, prepare, text_encoder
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 from vlgs.tables.multirun import note_run
 from vlgs.text import screen
@@ -35,24 +30,34 @@ log = logging.getLogger(__name__)
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
     """One run; in a multirun Hydra calls this once per combination."""
-    alone = HydraConfig.get().mode == RunMode.RUN and "HYDRA_FULL_ERROR" not in os.environ
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
+    several = HydraConfig.get().mode == RunMode.MULTIRUN
+    if several:
         tidy_sweep(Path(HydraConfig.get().sweep.dir))
+    status = run(config)
+    if status and not (several and status == UNSCORED):  # whose other runs go on
+        sys.exit(status)
+
+
+def command() -> None:
+    """The command line, from reading it to the exit status; an error is one line, unless HYDRA_FULL_ERROR asks for all of it."""
+    in_full = "HYDRA_FULL_ERROR" in os.environ
+    take_command_line()
     try:
-        status = run(config)
+        check_command(sys.argv[1:])
+        os.environ["HYDRA_FULL_ERROR"] = (
+            "1"  # or Hydra would print the error, and half of its traceback
+        )
+        main()
     except (ValueError, OSError, FloatingPointError) as error:
-        if not alone:
+        if in_full:
             raise
         print(screen(f"error: {error}"), file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
-        if not alone:
+        if in_full:
             raise
         print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(STOPPED)
-    several = HydraConfig.get().mode == RunMode.MULTIRUN
-    if status and not (several and status == UNSCORED):  # whose other runs go on
-        sys.exit(status)
 
 
 def run(config: DictConfig) -> int:
@@ -61,45 +66,46 @@ def run(config: DictConfig) -> int:
     Returns:
         The exit status: 0 when the results are there, else `STOPPED` or `UNSCORED`.
     """
-    check_config(config)
-    import torch
-
-    from vlgs.interchange import file_digest
-
-    torch.set_num_threads(config.threads)
-    scenes = _scenes(config)
-    given = {key: config[group].get(key) for group, key in GIVEN_FILES}
-    augment = instantiate(config.augment)
-    augment.require(scenes)
-    read = [*(scene.fingerprint for scene in scenes.values()), augment.identity()]
-    read += [file_digest(path, key) for key, path in given.items() if path]
-    content = " ".join(filter(None, read))
-    folder = RunFolder(Path(config.results) / "runs" / run_id(config, content))
+    ready = prepare(config)
+    folder = RunFolder(Path(config.results) / "runs" / ready.run_id)
     note_run(folder.path)
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
         )
-    with folder.writing() as own:
-        return _run_in(own, config, scenes)
+    with folder.writing() as own, _removed_if_refused(folder):
+        return _run_in(own, config, ready.scenes)
 
 
-def _scenes(config: DictConfig) -> dict[int | None, Any]:
-    """Mask level -> scene; the last one, of whole objects where there are several, stands for what they share."""
-    if config.levels == "single":
-        return {config.data.get("level"): instantiate(config.data)}
-    return {level: instantiate(config.data, level=level) for level in LEVELS}
+@contextmanager
+def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
+    """Leave nothing of a run that is refused before its first iteration."""
+    try:
+        yield
+    except (ValueError, OSError):
+        begun = {".lock", folder.config.name}
+        if folder.path.is_dir() and all(path.name in begun for path in folder.path.iterdir()):
+            for path in folder.path.iterdir():
+                path.unlink()
+            for path in (folder.path, *folder.path.parents[:2]):
+                if not any(path.iterdir()):
+                    path.rmdir()
+        raise
 
 
-def _run_in(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> int:
+def _run_in(folder: RunFolder, config: DictConfig, scenes: Scenes) -> int:
     finished = folder.finished()
     if finished is not None:
         return _say(finished, folder, "already done, nothing computed")
+    from vlgs.data.plausible import plausibility_warnings
     from vlgs.module.stages import StoppedError, train_all
 
-    text = _text_encoder(config, next(reversed(scenes.values())))
+    scene = next(reversed(scenes.values()))
+    for doubt in (*doubts(config), *plausibility_warnings(scene, (*scene.train, *scene.test))):
+        log.warning("warning: %s", doubt)
+    text = text_encoder(config, scene)
     write_config(folder.config, config)
-    stages = _stages(folder, config, scenes)
+    stages = make_stages(folder, config, scenes)
     try:
         sharing, augment = instantiate(config.sharing), instantiate(config.augment)
         models = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
@@ -117,59 +123,10 @@ def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
     return UNSCORED if metrics.get("failure") else 0
 
 
-def _text_encoder(config: DictConfig, scene: Any) -> Any:
-    """What turns the scene's classes into vectors; None where nothing can be asked.
-
-    A word that it does not know is an error now, not after training.
-    """
-    from vlgs.query import encode_questions, words_of
-    from vlgs.query.text import VocabularyText
-
-    if scene.mask_vectors.shape[0] == 0:
-        return None
-    text, query = instantiate(config.text)(vocabulary=scene.vocabulary), instantiate(config.query)
-    if not words_of(scene, query):
-        log.warning(
-            "neither labels nor a vocabulary: language is trained but nothing can be asked (data.vocabulary=FILE, which "
-            "`python -m vlgs.vocabulary words.txt FILE` makes)"
-        )
-        return None
-    if isinstance(text, VocabularyText) and scene.vocabulary is None:
-        log.warning(
-            "no vocabulary: language is trained but not scored (data.vocabulary=FILE or text=clip)"
-        )
-        return None
-    encode_questions(query, text, scene)
-    return text
-
-
-def _stages(folder: RunFolder, config: DictConfig, scenes: dict[int | None, Any]) -> Any:
-    import torch
-
-    from vlgs.module.build import Parts
-    from vlgs.module.fit import FitOptions
-    from vlgs.module.stages import Stages
-
-    def make_parts() -> Parts:
-        # Initial weights of the fusion come from the global generator; every other draw has one of its own.
-        torch.manual_seed(config.seed)
-        return Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
-
-    def make_options() -> FitOptions:
-        meta = {
-            "config": record(config),
-            "fingerprint": " ".join(scene.fingerprint for scene in scenes.values()),
-        }
-        loggers = [instantiate(logger) for logger in config.logger.loggers]
-        return FitOptions(meta=meta, progress=config.progress, loggers=loggers)
-
-    return Stages(folder, make_parts, make_options, config.seed)
-
-
 def _report(
     folder: RunFolder,
     config: DictConfig,
-    scenes: dict[int | None, Any],
+    scenes: Scenes,
     models: list[Any],
     stages: Any,
     text: Any,
@@ -249,5 +206,4 @@ def _command() -> str:
 
 
 if __name__ == "__main__":
-    take_command_line()
-    main()
+    command()

@@ -92,10 +92,10 @@ def test_option_is_the_default_of_its_class(option: str, want: ViewBlend):
 @pytest.mark.parametrize(
     ("build", "arguments", "message"),
     [
-        (BetaBlend, {"alpha": 0.0}, "BetaBlend: alpha must be positive and finite, got 0.0"),
-        (BetaBlend, {"alpha": math.nan}, "alpha must be positive"),
+        (BetaBlend, {"alpha": 0.0}, "BetaBlend: alpha must be 0.001 to 1e.06, got 0.0"),
+        (BetaBlend, {"alpha": math.nan}, "alpha must be 0.001"),
         (FixedBlend, {"value": 1.5}, r"FixedBlend: value must be in \[0, 1\], got 1.5"),
-        (GaussianBlend, {"std": -1.0}, "std >= 0, got 0.0, -1.0"),
+        (GaussianBlend, {"std": -1.0}, "std must be 0 to 100, got -1"),
         (GaussianBlend, {"mean": 5.0, "out_of_range": "resample"}, "mean must be within 3 std"),
         (GaussianBlend, {"out_of_range": "wrap"}, "one of clamp, raw, resample, got 'wrap'"),
         (UniformBlend, {"convention": "slerp"}, "UniformBlend: convention must be one of"),

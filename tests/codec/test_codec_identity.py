@@ -17,7 +17,7 @@ def test_codes_are_the_embeddings():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="dim must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="dim must be 1 to 65536, got 0"):
         Identity(dim=0)
     with pytest.raises(ValueError, match="dim must be the embedding width 3, got 8"):
         Identity(dim=8).fit(torch.ones(1, 3), torch.ones(1))

@@ -279,7 +279,7 @@ def test_every_option_composes_and_keeps_the_contract(group: str, option: str):
     given = config(Path("x"), None, f"features/{group}={option}")
     if option == "maps":
         given.features.extractor.encoder.folder = "x"
-    check_targets(given)
+    check_targets(given, "features")
     extractor = instantiate(given.features.extractor)
     assert isinstance(extractor, Extractor)
     assert isinstance(extractor, MaskExtractor)
@@ -295,7 +295,7 @@ def test_an_extractor_of_your_own_needs_only_its_target():
         "+features.extractor._target_=my_lab.Masks",
         "plugins=[my_lab]",
     )
-    check_targets(given)
+    check_targets(given, "features")
     assert given.features.extractor == {"_target_": "my_lab.Masks"}
 
 

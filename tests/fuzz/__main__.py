@@ -19,7 +19,10 @@ COLUMNS = ("family", "tried", "right", "slowest_cpu_s", "largest_mb", "wall_s")
 def families() -> list[str]:
     """Names of the families, each a module of this folder."""
     names = (module.name for module in pkgutil.iter_modules(fuzz.__path__))
-    return sorted(name for name in names if name != "judge" and not name.startswith(("_", "test_")))
+    helpers = ("judge", "commands")
+    return sorted(
+        name for name in names if name not in helpers and not name.startswith(("_", "test_"))
+    )
 
 
 def run_family(name: str, seed: int, count: int, only: int | None = None) -> list[Outcome]:

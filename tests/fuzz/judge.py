@@ -19,7 +19,7 @@ from pathlib import Path
 SECONDS = 10.0
 MEGABYTES = 1000.0
 
-NAMED = re.compile(r"^(error: )?[\w./, -]+: .+", re.DOTALL)
+NAMED = re.compile(r"^(error: )?[^:\n]+: .+", re.DOTALL)
 """``<who>: <what> must be <expected>, got <actual>``, loosely: somebody says something."""
 
 

@@ -68,13 +68,13 @@ class Done:
 @pytest.fixture
 def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
     kept: list[Stages] = []
-    original = vlgs.run._stages
+    original = vlgs.run.make_stages
 
     def keeping(*arguments: object) -> Stages:
         kept.append(original(*arguments))  # type: ignore[arg-type]
         return kept[-1]
 
-    monkeypatch.setattr(vlgs.run, "_stages", keeping)
+    monkeypatch.setattr(vlgs.run, "make_stages", keeping)
 
     def go(*overrides: str) -> Done:
         assert vlgs.run.run(composed(*SHORT, *overrides, f"results={tmp_path}")) == 0

@@ -6,6 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from vlgs.values import require_range
+
 Convention = Literal["consistent", "paper"]
 
 
@@ -68,8 +70,8 @@ class BetaBlend(ViewBlend):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.alpha > 0 and np.isfinite(self.alpha)):
-            raise ValueError(f"BetaBlend: alpha must be positive and finite, got {self.alpha}")
+        # Farther out every draw is an end, or the middle, of [0, 1]: blend=fixed says so.
+        require_range("BetaBlend", 1e-3, 1e6, alpha=self.alpha)
 
     def draw(self, rng: np.random.Generator) -> float:
         """Return k in [0, 1]; with alpha = 0.2, 42 % of draws are within 0.01 of an end."""
@@ -99,10 +101,9 @@ class GaussianBlend(ViewBlend):
         _require_choice(
             "GaussianBlend", "out_of_range", self.out_of_range, ("clamp", "raw", "resample")
         )
-        if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std >= 0):
-            raise ValueError(
-                f"GaussianBlend: mean must be finite and std >= 0, got {self.mean}, {self.std}"
-            )
+        # With out_of_range=raw the camera leaves the world farther out.
+        require_range("GaussianBlend", -100, 100, mean=self.mean)
+        require_range("GaussianBlend", 0, 100, std=self.std)
         # Farther out, or narrower, a draw inside [0, 1] is so rare that resampling might not end.
         if self.out_of_range == "resample" and not -3 * self.std <= self.mean <= 1 + 3 * self.std:
             raise ValueError(

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vlgs.files import write_atomically
+from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +25,8 @@ FORMAT = "vlgs-autoencoder-2"
 """Part of the cache key: a change of the code that moves the weights changes it."""
 CHECKS = 5
 """Times that the reconstruction is measured over the last fifth of the steps; the best weights stay."""
+WIDEST = 8192
+"""Two layers of this width take half a gigabyte."""
 MEASURED = 8192
 """Most embeddings that a measurement looks at, evenly spaced among the sorted ones: of 81 000 it would cost more than the fit."""
 
@@ -47,19 +50,13 @@ class AutoencoderTraining:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 2:
-                raise ValueError(
-                    f"autoencoder: {name} must be at least 2, got {getattr(self, name)}"
-                )
-        for name in ("area_power", "code_noise"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ValueError(
-                    f"autoencoder: {name} must be at least 0, got {getattr(self, name)}"
-                )
-        if not 0.0 < self.learning_rate < float("inf"):
+        require_range("autoencoder", 2, 10**7, steps=self.steps)
+        require_range("autoencoder", 2, 2**20, batch=self.batch)
+        require_range("autoencoder", 0, 10, area_power=self.area_power, code_noise=self.code_noise)
+        require_range("autoencoder", 0, 2**63 - 1, seed=self.seed)
+        if not 0.0 < self.learning_rate <= 1.0:
             raise ValueError(
-                f"autoencoder: learning_rate must be positive, got {self.learning_rate}"
+                f"autoencoder: learning_rate must be above 0 and at most 1, got {self.learning_rate}"
             )
         if not 0.0 < self.min_coverage <= 1.0:
             raise ValueError(
@@ -111,9 +108,10 @@ class Autoencoder(nn.Module):
     ) -> None:
         super().__init__()
         widths = (dim, *encoder_widths, *decoder_widths)
-        if min(widths) < 1 or not encoder_widths or not decoder_widths:
+        inside = all(1 <= width <= WIDEST for width in widths)
+        if not inside or not encoder_widths or not decoder_widths:
             raise ValueError(
-                "autoencoder: dim and one width or more on each side must be at least 1, got "
+                f"autoencoder: dim and one width or more on each side must be 1 to {WIDEST}, got "
                 f"{dim}, {list(encoder_widths)}, {list(decoder_widths)}"
             )
         self.dim = dim

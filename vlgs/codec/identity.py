@@ -4,6 +4,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.values import require_range
+
 
 class Identity(nn.Module):
     """Codes are the embeddings (d = e), for lifting and for judging what compression costs.
@@ -17,8 +19,7 @@ class Identity(nn.Module):
 
     def __init__(self, dim: int = 512) -> None:
         super().__init__()
-        if dim < 1:
-            raise ValueError(f"identity codec: dim must be at least 1, got {dim}")
+        require_range("identity codec", 1, 65536, dim=dim)
         self.dim = dim
 
     def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:

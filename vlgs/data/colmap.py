@@ -31,11 +31,18 @@ from vlgs.data.masks import (
     stray_faults,
     width_warnings,
 )
-from vlgs.data.registered import ImageFolder, attach_labels, coverage_warnings, open_views
+from vlgs.data.registered import (
+    ImageFolder,
+    attach_labels,
+    coverage_warnings,
+    open_views,
+    scale_faults,
+)
 from vlgs.data.sparse import SparseModel, find_sparse, model_faults, read_sparse
 from vlgs.data.split import Split
 from vlgs.data.views import ViewSource
 from vlgs.types import Scene, Vocabulary
+from vlgs.values import require_fields
 
 log = logging.getLogger(__name__)
 
@@ -87,6 +94,7 @@ class ColmapSource:
     """What the paths of a data set's configuration are put together from; `name` says what is looked for."""
 
     def __post_init__(self) -> None:
+        require_fields("data", self)
         if not 0 < self.resize <= 1:
             raise ValueError(f"data: resize must be in (0, 1], got {self.resize}")
         if self.level not in range(4):
@@ -182,6 +190,7 @@ def survey(source: ColmapSource) -> Survey:
     views = faults.take(open_views(model, images))
     faults += coverage_warnings(model, views, images)
     faults += transparency_warnings([view.photograph for view in views], images.path)
+    faults += scale_faults(views)
     labels = faults.take(_open_labels(source, views))
     views = faults.take(attach_labels(views, labels, images))
     faults += source.rule.faults(*_names(views), str(source.folder))

@@ -1,4 +1,4 @@
-"""What a sound scene may still have against it: doubts for `vlgs.check`, never errors."""
+"""What a sound scene may still have against it: doubts that `vlgs.check` lists and `vlgs.run` logs, never errors."""
 
 from collections.abc import Iterator, Sequence
 
@@ -15,9 +15,20 @@ _NEAR = 0.01
 _TOO_CLOSE = 0.01
 """Share of a view's median depth; a point nearer than this fills the image."""
 
+_FAR = 1e12
+"""Coordinate beyond which a point is left out (`vlgs.gaussians.init.MAX_COORDINATE`)."""
+
+_SMALL = 16
+"""Pixels on the shorter side below which SSIM's window of 11 sees borders more than image."""
+
+_FOCAL = (0.02, 500.0)
+"""Focal lengths in image widths: fields of view of 175 and 0.1 degrees."""
+
 
 def plausibility_warnings(scene: Scene, views: Sequence[View]) -> Iterator[Fault]:
-    """Scale of the world, points at cameras, labels that are not tested, categories that are one word spelled twice."""
+    """Cameras, points, scale of the world, labels that are not tested, categories that are one word spelled twice."""
+    yield from _camera_warnings(views)
+    yield from _point_warnings(scene)
     yield from _scale_warnings(scene, views)
     labelled = {v.name for v in views if v.read_dense_labels or v.read_object_labels}
     tested = labelled & {v.name for v in scene.test}
@@ -30,6 +41,46 @@ def plausibility_warnings(scene: Scene, views: Sequence[View]) -> Iterator[Fault
     if twice := [name for names in by_key.values() if len(names) > 1 for name in names]:
         what = f"classes should differ in more than spelling, got {listing(map(repr, twice))}"
         yield warning(scene.name, what, "each is scored as a class of its own")
+
+
+def _camera_warnings(views: Sequence[View]) -> Iterator[Fault]:
+    """Image sizes, focal lengths and principal points that no photograph has."""
+    small, focal, center = [], [], []
+    for view in views:
+        camera = view.camera
+        (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+        if min(camera.width, camera.height) < _SMALL:
+            small.append(f"{view.name} ({camera.width} x {camera.height})")
+        if not all(_FOCAL[0] <= f / camera.width <= _FOCAL[1] for f in (fx, fy)):
+            focal.append(f"{view.name} ({fx:.3g})")
+        if not (abs(cx / camera.width - 0.5) <= 1 and abs(cy / camera.height - 0.5) <= 1):
+            center.append(f"{view.name} ({cx:.3g}, {cy:.3g})")
+    if small:
+        what = f"images should be at least {_SMALL} pixels wide and high, got {listing(small, 3)}"
+        yield warning("cameras", what, "scores of so few pixels mean little")
+    if focal:
+        low, high = _FOCAL
+        what = f"focal lengths should be {low:g} to {high:g} image widths, got {listing(focal, 3)}"
+        yield warning("cameras", what, "look at the cameras of the sparse model")
+    if center:
+        what = f"principal points should lie near the image, got {listing(center, 3)}"
+        yield warning("cameras", what, "look at the cameras of the sparse model")
+
+
+def _point_warnings(scene: Scene) -> Iterator[Fault]:
+    """Points too far away to be used, or too few different ones to begin with."""
+    if len(scene.points) == 0:
+        what = "sparse points should be at least 1, got 0"
+        yield warning(scene.name, what, "training begins with random points")
+        return
+    usable = (scene.points.abs() <= _FAR).all(dim=1)
+    if not usable.all():
+        what = f"sparse points should lie within {_FAR:g} world units, got {int((~usable).sum())} of {len(usable)} that do not"
+        yield warning(scene.name, what, "these are left out")
+    distinct = len(torch.unique(scene.points[usable], dim=0))
+    if distinct < min(4, len(usable)):
+        what = f"sparse points should be at least 4 different ones, got {distinct} of {len(usable)}"
+        yield warning(scene.name, what, "little can grow from so few")
 
 
 def _scale_warnings(scene: Scene, views: Sequence[View]) -> Iterator[Fault]:

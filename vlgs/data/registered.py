@@ -1,5 +1,6 @@
 """The registered images of a reconstruction, joined with their files."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -81,6 +82,20 @@ def open_views(
         faults.append(Fault(str(folder.path), f"{what}: {listing(missing, 20)}"))
     # A camera that cannot be undistorted is one fault, however many images it took.
     return tuple(views.values()), tuple(dict.fromkeys(faults))
+
+
+def scale_faults(views: Sequence[ViewSource]) -> Iterator[Fault]:
+    """Photographs that are scaled otherwise than most of their camera's: each fits the camera, but a swapped file does that too."""
+    by_camera: dict[tuple[int, int], list[Photograph]] = {}
+    for view in views:
+        by_camera.setdefault(view.camera_size, []).append(view.photograph)
+    for photographs in by_camera.values():
+        sizes = Counter((photo.width, photo.height) for photo in photographs)
+        (width, height), _ = sizes.most_common(1)[0]
+        for photo in photographs:
+            if max(abs(photo.width - width), abs(photo.height - height)) > 1:
+                what = f"size must be {width} x {height} as most of its camera's, got {photo.width} x {photo.height}"
+                yield Fault(str(photo.path), what, "is it another photograph?")
 
 
 def coverage_warnings(

@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from vlgs.arguments import take_command_line
+from vlgs.command import check_command
 from vlgs.config import CONF, check_targets
 from vlgs.features import job as work
 
@@ -22,7 +23,7 @@ def main(config: DictConfig) -> None:
         missing = sorted(OmegaConf.missing_keys(config))
         if missing:
             raise ValueError(f"features: {missing[0]} must be given, as {missing[0]}=VALUE")
-        check_targets(config)
+        check_targets(config, "features")
         torch.set_num_threads(config.threads)
         extract(config)
     except KeyboardInterrupt:
@@ -55,4 +56,8 @@ if __name__ == "__main__":
     # Hydra takes no flags of ours.
     sys.argv = ["dry_run=true" if word == "--dry-run" else word for word in sys.argv]
     take_command_line()
+    try:
+        check_command(sys.argv[1:], "features")
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
     main()

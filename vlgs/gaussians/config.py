@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from vlgs.values import require_range
+
 
 @dataclass(frozen=True)
 class DensifyConfig:
@@ -93,7 +95,9 @@ class GaussiansConfig:
         _require_inside_unit(
             "gaussians", init_opacity=self.init_opacity, init_indicator=self.init_indicator
         )
-        _require_at_least("gaussians", 1, init_points=self.init_points, max_count=self.max_count)
+        # Many more have no place in memory; random ones are drawn by the dozen and the best are kept.
+        require_range("gaussians", 1, 10**7, init_points=self.init_points)
+        require_range("gaussians", 1, 10**9, max_count=self.max_count)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),

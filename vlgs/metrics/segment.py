@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vlgs.metrics.smooth import box_mean, majority_vote, pool_mean, pool_vote
+from vlgs.values import require_range
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,12 @@ class Constants:
                 "protocol: window must be filter2d or pool and vote_edge clipped or full, got "
                 f"{self.window!r} and {self.vote_edge!r}"
             )
-        if self.box < 1 or (self.window == "pool" and self.box % 2 == 0):
+        require_range("protocol", 1, 65536, box=self.box, vote=self.vote)
+        if self.window == "pool" and self.box % 2 == 0:
             raise ValueError(
                 f"protocol: box must be positive, and odd with window=pool, got {self.box}"
             )
-        if self.vote < 1 or self.vote % 2 == 0:
+        if self.vote % 2 == 0:
             raise ValueError(f"protocol: vote must be positive and odd, got {self.vote}")
         if not (0 <= self.blend <= 1 and 0 <= self.threshold < 1):
             raise ValueError(

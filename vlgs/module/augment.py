@@ -17,6 +17,7 @@ from vlgs.files import write_atomically
 from vlgs.module.sampler import nearest_views
 from vlgs.render.model import SplatModel
 from vlgs.types import Camera, Scene, View
+from vlgs.values import require_range
 
 _CAMERAS = 7  # purpose of draws
 
@@ -60,10 +61,7 @@ class Offline:
     """A `vlgs.features.Extractor`, which is run on the rendered images; None asks the scene (`Scene.supervise`)."""
 
     def __post_init__(self) -> None:
-        if self.views < 1 or self.neighbours < 1:
-            raise ValueError(
-                f"augment: views and neighbours must be at least 1, got {self.views}, {self.neighbours}"
-            )
+        require_range("augment", 1, 10**5, views=self.views, neighbours=self.neighbours)
         if self.pairs not in ("neighbours", "uniform"):
             raise ValueError(f"augment: pairs must be neighbours or uniform, got {self.pairs}")
 

@@ -1,12 +1,17 @@
 """Settings of a training run, mirrored by conf/trainer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+
+from vlgs.values import require_range
+
+MOST_ITERATIONS = 10**9
+"""A thousand times what anybody trains."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's rates per parameter (tab:lr); rates the paper does not give are marked."""
+    """Adam's rates per parameter (tab:lr), 0 to 1; rates the paper does not give are marked. What has a rate of 0 does not learn."""
 
     means: float = 1.6e-4
     """Multiplied by the scene extent, decays log-linearly to `means_final` over `TrainerConfig.means_steps`."""
@@ -22,6 +27,9 @@ class LearningRates:
     features: float = 5e-3
     fusion: float = 1e-3
     """The paper is silent (systems.md D.6)."""
+
+    def __post_init__(self) -> None:
+        require_range("learning_rates", 0, 1, **asdict(self))
 
     def of(self, parameter: str) -> float:
         """Rate of a parameter of the Gaussians; language's own shape is learned like colour's."""
@@ -72,8 +80,7 @@ class TrainerConfig:
     skip: SkipConfig = field(default_factory=SkipConfig)
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"trainer: iterations must be at least 1, got {self.iterations}")
+        require_range("trainer", 1, MOST_ITERATIONS, iterations=self.iterations)
         if self.sh_every < 1 or self.log_every < 1 or self.checkpoint_every < 0:
             raise ValueError(
                 "trainer: sh_every and log_every must be at least 1 and checkpoint_every at least 0, got "
@@ -87,4 +94,6 @@ class TrainerConfig:
         """Learning rate of positions at a step, in units of the scene extent (3DGS's log-linear decay)."""
         share = min(step / (self.means_steps or self.iterations), 1.0)
         rates = self.learning_rates
+        if rates.means == 0 or rates.means_final == 0:
+            return rates.means * (1 - share) + rates.means_final * share  # no logarithm leads to 0
         return rates.means * (rates.means_final / rates.means) ** share

@@ -11,7 +11,6 @@ from typing import Any
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from vlgs.config import (
     CONF,
@@ -19,7 +18,6 @@ from vlgs.config import (
     PLACES,
     RESULTS_VERSION,
     Identity,
-    check_targets,
     identity,
 )
 from vlgs.files import write_atomically, write_changed
@@ -211,17 +209,12 @@ def _tree_digest() -> str:
 
 
 def _compose(overrides: list[str]) -> DictConfig:
-    from hydra import compose, initialize_config_dir
-    from hydra.errors import ConfigCompositionException, HydraException
+    from vlgs.command import composed
 
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("config", overrides=overrides)
-        check_targets(config)
-    except (ConfigCompositionException, OmegaConfBaseException, HydraException) as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise UnknownOptionError(f"{' '.join(overrides) or 'the defaults'}: {reason}") from error
-    return config
+        return composed(overrides)
+    except ValueError as error:
+        raise UnknownOptionError(f"{' '.join(overrides) or 'the defaults'}: {error}") from error
 
 
 def _moves(override: str) -> bool:

@@ -1,0 +1,55 @@
+"""`conf` is the schema: it mirrors the constructors, and `--help` prints it."""
+
+import inspect
+
+import pytest
+from hydra.utils import get_object
+
+from vlgs.command import check_command
+from vlgs.known import CONF, contents, groups, nodes, options, place
+from vlgs.manual import describe
+
+FREE = {"vlgs.data.colmap.load_scene", "vlgs.fusion.none.NoFusion"}
+"""These take what their files say, or anything."""
+
+SINCE_THE_SCENE = {"vocabulary"}
+"""Given by the run, not by the configuration."""
+
+
+def constructed() -> dict[str, set[str]]:
+    """Target -> all keys that any file of conf gives it."""
+    found: dict[str, set[str]] = {}
+    for path in CONF.rglob("*.yaml"):
+        for _, node in nodes(contents(path), place(path)):
+            target = node.get("_target_")
+            if isinstance(target, str) and target.startswith("vlgs."):
+                found.setdefault(target, set()).update(map(str, node))
+    return found
+
+
+@pytest.mark.parametrize("target", sorted(set(constructed()) - FREE))
+def test_conf_mirrors_constructors(target: str):
+    given = constructed()[target] - {"_target_", "_partial_"}
+    taken = set(inspect.signature(get_object(target)).parameters) - SINCE_THE_SCENE
+    assert given <= taken
+    if target not in ("vlgs.module.settings.TrainerConfig", "vlgs.blend.NoBlend"):
+        assert given == taken
+
+
+@pytest.mark.parametrize("group", sorted(groups()))
+def test_help_lists_the_keys_of_every_option(group: str):
+    for option in options(group):
+        text = describe(group, option)
+        for key in contents(CONF / group / f"{option}.yaml"):
+            assert f"{key}" in text or key in ("_target_", "_partial_", "defaults")
+
+
+def test_help_of_an_option_has_defaults_and_comments(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        check_command(["--help", "data=lerf_ovs"])
+    assert not stop.value.code
+    out = capsys.readouterr().out
+    assert "data.resize=1.0" in out  # of colmap, which it is made from
+    assert "data.scene=???" in out
+    assert "figurines, ramen, teatime, waldo_kitchen" in out
+    assert "output size as a fraction of the image file's" in out

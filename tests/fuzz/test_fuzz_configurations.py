@@ -1,0 +1,50 @@
+"""A sample of `tests.fuzz.configurations`: check and run refuse the same in the same words, at once, and leave nothing."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.commands import TINY, both
+from vlgs.command import check_command
+
+REFUSED = {
+    "trainer.iterations=0": "iterations must be 1 to 1e+09, got 0",
+    "trainer.learning_rates.means=-1.0": "learning_rates: means must be 0 to 1, got -1.0",
+    "seed=18446744073709551616": "config: seed must be a whole number",
+    "threads=100000": "config: threads must be 1 to 256, got 100000",
+    "blend.alpha=nan": "blend: alpha must be a finite number, got nan",
+    "gaussians.densify=null": "gaussians: densify must be",
+    "query.negatives=[unheard]": "query: the text encoder must know the negatives unheard",
+    "raster.alpha_max=1.0": "RasterConfig: alpha_max must be below 1",
+}
+AT_ONCE = {
+    "trainr=photos": "trainr must be a key, got one that is not there; did you mean trainer?",
+    "+trainr=photos": "trainr must be a key that is read, got one that nothing reads; did you mean trainer?",
+    "+trainer.iteration=100": "did you mean trainer.iterations?",
+    "trainer=phots": "trainer must be one of .* did you mean photos?",
+    "trainer=base": "trainer must be one of",
+    "data.rot=": "did you mean data.root?",
+    "data.root=x": "data=colmap or .* has it",
+    "~fusion": "which takes fusion away",
+    "+seed=1": "seed must be given without",
+    "data.root=a b[": "arguments must be KEY=VALUE",
+    "fusion=null": "fusion must be one of",
+    "-m fusion=none,mpl": "did you mean mlp?",
+    "-m +foo=1,2": "foo must be a key that is read",
+}
+
+
+@pytest.mark.parametrize("line", AT_ONCE)
+def test_a_mistake_is_told_before_anything_is_imported(line: str):
+    arguments = [line] if line.startswith("data.root") else line.split()
+    with pytest.raises(ValueError, match=AT_ONCE[line].replace("?", r"\?").replace("+", r"\+")):
+        check_command(arguments)
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_check_and_run_refuse_alike(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    checked, ran = both([*TINY, line], tmp_path / "results")
+    assert REFUSED[line] in ran.error
+    assert checked.status == ran.status == 1
+    assert not (tmp_path / "results").exists()

@@ -1,0 +1,177 @@
+"""What `conf` knows: its groups and options, the keys that are read, the parts that a ``_target_`` may name. Imports no torch.
+
+A file of `conf` mirrors the arguments of the class that it names, so that these files are the schema of the configuration.
+"""
+
+import difflib
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_INSIDE = Path(__file__).resolve().parent / "conf"
+CONF = _INSIDE if (_INSIDE / "config.yaml").is_file() else _INSIDE.parents[1] / "conf"
+"""Folder of the configuration: inside the package in an installed wheel, beside it in a checkout. What lies beside an installed
+package (``site-packages/conf``) is somebody else's."""
+
+_LOGGERS = frozenset(
+    f"lightning.pytorch.loggers.{name}Logger"
+    for name in ("CSV", "Comet", "MLFlow", "Neptune", "TensorBoard", "Wandb")
+)
+"""Lightning's own, whose arguments are theirs to check."""
+
+_SHARED = "not an option by itself"
+"""Comment of a file that others are made from."""
+
+_PACKAGE = re.compile(r"^# @package (\S+)", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class _Schema:
+    """All that the files say; keys are dotted and start at the root."""
+
+    targets: Mapping[str, frozenset[str]]
+    arguments: Mapping[str, frozenset[str]]
+    keys: frozenset[str]
+
+
+def targets(name: str) -> frozenset[str]:
+    """Parts of ours that may stand at a key of this name: those that stand there in `conf`.
+
+    Example:
+        >>> sorted(targets("indicator"))[0]
+        'vlgs.indicator.ColourOpacity'
+    """
+    return _schema().targets.get(name, frozenset())
+
+
+def is_ours(target: object) -> bool:
+    """Whether a target stands in `conf`, wherever."""
+    return any(target in [*names] for names in _schema().targets.values())
+
+
+def groups() -> frozenset[str]:
+    """Folders of options, without Hydra's own: ``data``, ``features/encoder``."""
+    folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")}
+    return frozenset(f for f in folders if f != "." and f.partition("/")[0] != "hydra")
+
+
+def options(group: str) -> list[str]:
+    """Names of the options of a group, in alphabetical order."""
+    files = sorted((CONF / group).glob("*.yaml"))
+    return [path.stem for path in files if _SHARED not in path.read_text()]
+
+
+def unread(config: Mapping[str, Any], name: str = "config") -> Iterator[tuple[str, list[str]]]:
+    """Keys of a configuration that nothing reads, each with the keys that could have been meant.
+
+    Args:
+        config: Plain.
+        name: Of the primary file, which says what stands at the root.
+    """
+    top = _top(name)
+    for key, value in config.items():
+        if key not in top:
+            yield str(key), near(str(key), top | {g for g in groups() if "/" not in g})
+        elif isinstance(value, Mapping | list):
+            yield from _unread_in(str(key), value)
+
+
+def near(word: str, words: Collection[str]) -> list[str]:
+    """The words that a mistyped one could have been, the likeliest first."""
+    return difflib.get_close_matches(word, sorted(words), n=3, cutoff=0.6)
+
+
+def contents(path: Path) -> dict[str, Any]:
+    """Content of a file of `conf`; empty for one of comments alone."""
+    return yaml.safe_load(path.read_text()) or {}
+
+
+def place(path: Path) -> str:
+    """Key under which the content of a file of `conf` goes: its group's, or that of its package line; empty for the root."""
+    found = _PACKAGE.search(path.read_text())
+    if found:
+        return found[1].replace("_global_", "")
+    folder = path.relative_to(CONF).parent
+    return ".".join(folder.parts)
+
+
+def nodes(node: Any, key: str = "") -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    """Every mapping inside, with its dotted key."""
+    if isinstance(node, Mapping):
+        yield key, node
+        for name, child in node.items():
+            yield from nodes(child, join(key, name))
+    elif isinstance(node, list | tuple):
+        for index, child in enumerate(node):
+            yield from nodes(child, join(key, index))
+
+
+def join(key: str, name: object) -> str:
+    """A dotted key."""
+    return f"{key}.{name}" if key else str(name)
+
+
+def last(key: str) -> str:
+    """The name in a dotted key that says what is expected there: the last one that is no index of a list."""
+    names = [name for name in key.split(".") if not name.isdigit()]
+    return names[-1] if names else ""
+
+
+def _unread_in(key: str, node: Any) -> Iterator[tuple[str, list[str]]]:
+    if isinstance(node, list):
+        for index, child in enumerate(node):
+            yield from _unread_in(join(key, index), child)
+    if not isinstance(node, Mapping) or key == "data.release":
+        return
+    target = node.get("_target_")
+    if target is not None and (not is_ours(target) or target in _LOGGERS):
+        return  # somebody else's, whose constructor says what it takes
+    known = _schema().arguments.get(str(target), frozenset()) | {"_target_", "_partial_"}
+    if target is None:
+        known = {k.rpartition(".")[2] for k in _schema().keys if k.rpartition(".")[0] == key}
+    for name, child in node.items():
+        if name not in known:
+            meant = near(str(name), known)
+            yield join(key, name), [join(key, other) for other in meant]
+        else:
+            yield from _unread_in(join(key, name), child)
+
+
+@cache
+def _top(name: str) -> frozenset[str]:
+    content = contents(CONF / f"{name}.yaml")
+    chosen = {str(g) for entry in content["defaults"] if isinstance(entry, dict) for g in entry}
+    chosen = {group for group in chosen if not group.startswith("override ")}
+    kept = set(content) - {"defaults", "hydra"}
+    return frozenset(kept | chosen | {"features"})  # what augment=offline_sam brings
+
+
+@cache
+def _schema() -> _Schema:
+    found: dict[str, set[str]] = defaultdict(set, loggers=set(_LOGGERS))
+    names: dict[str, set[str]] = defaultdict(set)
+    at: dict[str, set[str]] = defaultdict(set)  # key -> targets that stand there
+    keys: set[str] = set()
+    files = [path for path in CONF.rglob("*.yaml") if path.relative_to(CONF).parts[0] != "hydra"]
+    every = [pair for path in files for pair in nodes(contents(path), place(path))]
+    for key, node in every:
+        keys |= {key, *(join(key, name) for name in node if name != "defaults")}
+        target = node.get("_target_")
+        if isinstance(target, str) and target != "???":
+            found[last(key)].add(target)
+            at[key].add(target)
+            names[target] |= set(node)
+    for key, node in every:  # options that change a few arguments of another: trainer.iterations
+        for target in at[key] if "_target_" not in node else ():
+            names[target] |= set(node)
+    return _Schema(
+        {key: frozenset(values) for key, values in found.items()},
+        {key: frozenset(values) - {"defaults"} for key, values in names.items()},
+        frozenset(keys),
+    )

@@ -1,0 +1,53 @@
+"""What `--help` says of an option: its keys, their defaults and what the comments of its file say. Imports no torch."""
+
+import re
+from collections.abc import Iterator
+
+from vlgs.known import CONF, contents, place
+
+_KEY = re.compile(r"^(?P<indent> *)(?P<name>[\w$]+):(?P<value>(?: [^#]*)?)(?:# ?(?P<note>.*))?$")
+
+
+def describe(group: str, option: str) -> str:
+    """The keys of one option as they stand on a command line.
+
+    Example:
+        >>> print(describe("fusion", "mlp"))
+        fusion=mlp
+          fusion.color_dim=3
+          fusion.feature_dim=${code_channels:${levels},${codec.dim}}
+          fusion.residual=true
+    """
+    path = CONF / group / f"{option}.yaml"
+    lines = path.read_text().splitlines()
+    about = [line[2:] for line in lines if line.startswith("# ") and "@package" not in line]
+    keys = dict(_keys(group, option))
+    width = min(44, max((len(f"{key}={value}") for key, (value, _) in keys.items()), default=0))
+    rows = []
+    for key, (value, note) in keys.items():
+        pair = f"{key}={value}"
+        rows.append(f"  {pair:<{width}}  {note}".rstrip())
+    return "\n".join([f"{group}={option}", *(f"  {line}" for line in about), *rows])
+
+
+def _keys(group: str, option: str) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Key -> value and comment, first those of the options that this one is made from."""
+    path = CONF / group / f"{option}.yaml"
+    for entry in contents(path).get("defaults", []):
+        if isinstance(entry, str) and entry != "_self_":
+            yield from _keys(group, entry.partition("@")[0])
+    root, parents, skipping = place(path), list[tuple[int, str]](), False
+    for line in path.read_text().splitlines():
+        found = _KEY.match(line)
+        if not line.startswith(" "):
+            skipping = line.startswith("defaults:")
+        if found is None or skipping:
+            continue
+        indent = len(found["indent"])
+        parents = [(depth, name) for depth, name in parents if depth < indent]
+        names = [name for name in (root, *(name for _, name in parents), found["name"]) if name]
+        value, note = found["value"].strip(), found["note"] or ""
+        if not value:
+            parents.append((indent, found["name"]))
+        elif found["name"] not in ("_target_", "_partial_") or value == "???":
+            yield ".".join(names), (value, note)
