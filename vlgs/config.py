@@ -192,7 +192,7 @@ def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, A
         (signature.bind_partial if given.get("_partial_") else signature.bind)(**values)
     except TypeError as error:
         raise ValueError(
-            f"{who}: arguments must be those of {made.__name__}, got {error}"
+            f"{who}: arguments must be those of {made.__name__}, got others ({error})"
         ) from error
     plain = {k: v for k, v in values.items() if not (isinstance(v, Mapping) and "_target_" in v)}
     hints = typing.get_type_hints(made.__init__ if isinstance(made, type) else made)

@@ -5,7 +5,7 @@ import os
 import resource
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ from vlgs.text import screen
 
 log = logging.getLogger(__name__)
 
+_IN_FULL = "HYDRA_FULL_ERROR" in os.environ
+
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
@@ -33,28 +35,36 @@ def main(config: DictConfig) -> None:
     several = HydraConfig.get().mode == RunMode.MULTIRUN
     if several:
         tidy_sweep(Path(HydraConfig.get().sweep.dir))
-    status = run(config)
+    # In a multirun Hydra notes an error and goes on with the other runs; `command` says the first when all are done.
+    with nullcontext() if several else _errors_in_a_line():
+        status = run(config)
     if status and not (several and status == UNSCORED):  # whose other runs go on
         sys.exit(status)
 
 
 def command() -> None:
-    """The command line, from reading it to the exit status; an error is one line, unless HYDRA_FULL_ERROR asks for all of it."""
-    in_full = "HYDRA_FULL_ERROR" in os.environ
-    take_command_line()
-    try:
+    """The command line, from reading it to the exit status."""
+    with _errors_in_a_line():
+        take_command_line()
         check_command(sys.argv[1:])
         os.environ["HYDRA_FULL_ERROR"] = (
-            "1"  # or Hydra would print the error, and half of its traceback
+            "1"  # or Hydra would end a multirun with half of a traceback
         )
         main()
+
+
+@contextmanager
+def _errors_in_a_line() -> Iterator[None]:
+    """End the process with what is wrong, unless HYDRA_FULL_ERROR asks for the traceback."""
+    try:
+        yield
     except (ValueError, OSError, FloatingPointError) as error:
-        if in_full:
+        if _IN_FULL:
             raise
         print(screen(f"error: {error}"), file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
-        if in_full:
+        if _IN_FULL:
             raise
         print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(STOPPED)

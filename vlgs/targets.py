@@ -18,6 +18,8 @@ _NOT_PLUGINS = frozenset(sys.stdlib_module_names) | {
 
 _LOGGING = frozenset({"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"})
 _STREAMS = frozenset({"ext://sys.stdout", "ext://sys.stderr"})
+_OWN_FORMATTER = "vlgs.text.ScreenFormatter"
+_OWN_CALLBACK = ("hydra.callbacks.table._target_", "vlgs.tables.multirun.MultirunTable")
 _HYDRAS = ("hydra_plugins.", "hydra._internal.core_plugins.")
 """Where Hydra's launchers and sweepers are."""
 
@@ -55,9 +57,12 @@ def check_hydra(node: Mapping[str, Any]) -> None:
     for key, inner in nodes(node, "hydra"):
         for name, value in inner.items():
             full = join(key, name)
-            if key.startswith("hydra.callbacks"):
-                raise ValueError(f"config: hydra.callbacks must be empty, got {full}")
-            if name == "_target_":
+            if key.startswith("hydra.callbacks."):
+                if (full, value) != _OWN_CALLBACK:
+                    raise ValueError(
+                        f"config: hydra.callbacks must be left alone, got {full}={value!r}"
+                    )
+            elif name == "_target_":
                 own = full in ("hydra.launcher._target_", "hydra.sweeper._target_")
                 if not own or not str(value).startswith(_HYDRAS):
                     raise ValueError(f"config: {full} must be a launcher of Hydra's, got {value!r}")
@@ -123,7 +128,7 @@ def _check(key: str, target: object, trusted: Collection[str]) -> None:
 
 def _check_logging(key: str, name: object, value: object) -> None:
     """`logging.config` calls what stands at ``()`` and imports what a class or ``ext://`` names."""
-    allowed = name not in ("()", ".")
+    allowed = name != "." and (name != "()" or value == _OWN_FORMATTER)
     if name == "class":
         allowed = value in _LOGGING
     if isinstance(value, str) and "ext://" in value:
