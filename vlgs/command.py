@@ -209,8 +209,11 @@ def _meant(key: str, known: Collection[str]) -> str:
     beside = {k.rpartition(".")[2] for k in {*known, *every} if k.rpartition(".")[0] == above}
     if not above:
         beside |= groups()
-    close = near(word, {name for name in beside if not name.startswith("_")})
-    return f"; did you mean {' or '.join(above + dot + name for name in close)}?" if close else ""
+    beside = {name for name in beside if not name.startswith("_")}
+    close = near(word, beside)
+    if close:
+        return f"; did you mean {' or '.join(above + dot + name for name in close)}?"
+    return f"; {above} has {', '.join(sorted(beside))}" if above and beside else ""
 
 
 @cache

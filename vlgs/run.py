@@ -54,6 +54,17 @@ def command() -> None:
 
 
 @contextmanager
+def _whole_errors() -> Iterator[None]:
+    """Have Hydra raise an error at the end of a multirun, which it would end with half of a traceback."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        if not _IN_FULL:
+            del os.environ["HYDRA_FULL_ERROR"]
+
+
+@contextmanager
 def _errors_in_a_line() -> Iterator[None]:
     """End the process with what is wrong, unless HYDRA_FULL_ERROR asks for the traceback."""
     try:

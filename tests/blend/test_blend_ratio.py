@@ -29,7 +29,7 @@ def draws(blend: ViewBlend, count: int = DRAWS) -> np.ndarray:
         (GaussianBlend(out_of_range="resample"), stats.truncnorm(0, 1)),
         (GaussianBlend(0.5, 0.1, "resample"), stats.truncnorm(-5, 5, 0.5, 0.1)),
     ],
-    ids=str,
+    ids=["beta", "beta(3)", "uniform", "gaussian", "resampled", "narrow"],
 )
 def test_draws_follow_their_law(blend: ViewBlend, law):
     assert stats.kstest(draws(blend), law.cdf).pvalue > 1e-3

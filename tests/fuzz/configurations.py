@@ -139,7 +139,7 @@ WRONG = (
     ("blend.ssim=on", "ssim"),
     ("sharing=none", "fusion"),
     ("sharing=lifted", "fusion"),
-    ("sharing.means=false", "covariances"),
+    ("sharing.means=false", "sharing"),
     ("augment=offline_sam features.weights=nowhere", "nowhere"),
     ("augment=offline augment.views=0", "views"),
     ("augment=offline augment.pairs=some", "pairs"),
@@ -191,7 +191,7 @@ GOOD = (
         "data.faults.missed=0",
         "data.level=0",
     ),
-    *("trainer.freeze=[means]", "gaussians.init_features=lifted", "gaussians.color=evaluated"),
+    *("gaussians.init_features=lifted", "gaussians.color=evaluated"),
 )
 """What must be taken."""
 

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import resource
+import signal
 import sys
 import tempfile
 import traceback
@@ -17,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 SECONDS = 10.0
+ENDLESS = 300
+"""Seconds by the clock after which a child that waits for something is ended; a busy machine takes its time."""
 MEGABYTES = 1000.0
 
 NAMED = re.compile(r"^(error: )?[^:\n]+: .+", re.DOTALL)
@@ -62,7 +65,7 @@ def run_attack(attack: Attack) -> Outcome:
         try:
             kind, said = json.load(pipe)
         except json.JSONDecodeError:
-            kind, said = "died", f"the process ended with {status}"
+            kind, said = "died", f"the process ended with {os.waitstatus_to_exitcode(status)}"
     seconds = usage.ru_utime + usage.ru_stime
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     megabytes = max(0, usage.ru_maxrss - before) / 1024
@@ -90,6 +93,7 @@ def _judge(
 def _child(attack: Attack, out: int) -> None:
     """Attack and tell; never returns."""
     resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
+    signal.alarm(ENDLESS)
     with tempfile.TemporaryFile() as noise:
         os.dup2(noise.fileno(), sys.stdout.fileno())
         os.dup2(noise.fileno(), sys.stderr.fileno())

@@ -122,7 +122,7 @@ def test_argmax_over_prompts_is_that_of_the_cosines(query: Query):
 @pytest.mark.parametrize("temperature", [0.0, -1.0, math.inf, math.nan])
 def test_temperature_must_be_positive(temperature: float):
     for query in (LerfRelevancy, VocabSoftmax):
-        with pytest.raises(ValueError, match="temperature must be positive"):
+        with pytest.raises(ValueError, match="temperature must be above 0"):
             query(temperature=temperature)
 
 

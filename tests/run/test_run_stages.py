@@ -112,11 +112,11 @@ def test_stopped_anywhere_it_goes_on_to_the_same_bits(
     ("overrides", "message"),
     [
         (["sharing=none"], "fusion must be none with sharing=none.*got vlgs.fusion.*SelfAttention"),
-        (["levels=both"], "levels must be single, separate or joint, got both"),
+        (["levels=both"], "levels must be single or separate or joint, got both"),
         (["indicator=per_level"], "levels must be joint with indicator=per_level, got single"),
         (["sharing=lifted"], "fusion must be .*NoFusion with sharing=lifted"),
         (["sharing=lifted", "fusion=none"], "indicator must be .*ColourOpacity or .*Fixed with"),
-        (["augment=offline", "augment.views=0"], "views and neighbours must be at least 1, got 0"),
+        (["augment=offline", "augment.views=0"], "views must be 1 to 100000, got 0"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(

@@ -238,7 +238,7 @@ DAMAGED = {
     "cut": (lambda text: text[: len(text) // 2], "must be JSON in UTF-8"),
     "empty": (lambda text: "{}", "config_hash must be a text, got None"),
     "list": (lambda text: "[]", "content must be an object"),
-    "nested": (lambda text: "[" * 100_000, "endless nesting"),
+    "nested": (lambda text: "[" * 100_000, "must be JSON of a run, got endless nesting"),
     "latin": (lambda text: text.replace("a cpu", "\udcff"), "must be JSON in UTF-8"),
     "word": (lambda text: text.replace('"psnr": ', '"psnr": "high", "old": '), "psnr must be a finite"),
     "nan": (lambda text: text.replace('"cup": ', '"cup": NaN, "old": ', 1), "per_category.cup must be"),
@@ -359,7 +359,7 @@ def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Pa
         with pytest.raises(ValueError, match=r"runs.csv: line \d must be as vlgs.tables writes it"):
             write_all(tmp_path, [table])
     files[0].write_bytes(before[0].replace(b",0,dense@1", b",first,dense@1"))
-    with pytest.raises(ValueError, match=r"runs.csv: must be as .*first"):
+    with pytest.raises(ValueError, match=r"runs.csv: line 2 must be as .*first"):
         write_all(tmp_path, [table])
     files[0].unlink()
     with pytest.raises(ValueError, match="must hold finished runs"):
