@@ -82,7 +82,7 @@ def load_scene(
         mask_vectors=torch.from_numpy(np.concatenate(vectors)),
         mask_areas=torch.from_numpy(areas).float(),
         classes=studio.classes,
-        class_kinds={thing.name: thing.kind for thing in studio.world.things},
+        class_kinds={thing.name: thing.kind for thing in studio.world.things if thing.masked},
         vocabulary=vocabulary(studio.classes),
         supervise=lambda camera, number: _supervise(recipe, folder, level, camera, number),
         fingerprint=recipe.fingerprint(level),
