@@ -73,6 +73,9 @@ class GaussiansConfig:
     """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (systems.md D.9, F.4)."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
+    background: int = 1500
+    """Directions all around in which far Gaussians are placed where views look past every sparse point (`vlgs.gaussians.background`)."""
+    background_opacity: float = 0.5
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""

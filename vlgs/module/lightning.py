@@ -15,7 +15,7 @@ from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import DensifyState, GaussiansConfig
-from vlgs.geometry import scene_extent
+from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
 from vlgs.module.blended import BlendPlan, CamerasBetween, plan_blend
 from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
@@ -103,7 +103,8 @@ class VLGSModule(L.LightningModule):
             near = nearest_views([view.camera for view in scene.train], blend.neighbours)
         self.sampler = PairSampler(sizes, seed, near)
         self.between = CamerasBetween(self.sampler, [v.camera for v in scene.train], blend)
-        self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
+        viewmats = torch.stack([view.camera.viewmat for view in scene.train])
+        self.extent, self.centers = scene_extent(viewmats), camera_center(viewmats).float()
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
         self.target_cache = PixelCache(self._room_for_targets())
