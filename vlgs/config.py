@@ -136,7 +136,7 @@ def instantiate(config: Any, **arguments: Any) -> Any:
         raise
 
 
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 """Part of every run id; raised by a change that can move a number."""
 
 PLACES = frozenset(

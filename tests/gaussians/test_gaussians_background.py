@@ -43,8 +43,14 @@ def shell(low: float) -> Tensor:
     return 4 * points[4 * points[:, 2] > low]
 
 
-def test_a_closed_room_has_no_background():
-    assert len(background(scene(shell(-5.0)), 500).points) == 0
+def test_behind_a_closed_room_there_is_the_mean_of_what_views_see():
+    cloud = background(scene(shell(-5.0)), 500)
+    assert len(cloud.points) == 500
+    height = cloud.points[:, 2] / cloud.points.norm(dim=1)
+    for wanted, rows in ((ABOVE, (height > 0.1) & (height < 0.3)), (BELOW, height < -0.1)):
+        colors = cloud.colors[rows & (height.abs() < 0.3)]
+        assert len(colors) > 20
+        torch.testing.assert_close(colors, (torch.tensor(wanted) / 255).expand_as(colors))
 
 
 @pytest.mark.parametrize(("points", "count"), [(shell(9.0), 500), (shell(-5.0), 0)])

@@ -1,7 +1,8 @@
-"""Far Gaussians where training views look past every sparse point: a sky, a plain wall.
+"""Far Gaussians behind everything, so that no ray ends in nothing.
 
-Structure from motion finds no points there. Without Gaussians behind everything, training explains such pixels by what it has:
-large, faint ones close to the cameras, which fit every training view and fog all others.
+Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training explains such pixels
+by what it has: large, faint ones close to the cameras, which fit every training view and fog all others. And where no training view
+looked, an unseen view would look through the scene into black.
 """
 
 import math
@@ -31,10 +32,9 @@ MAX_POINTS = 1 << 17
 def with_background(
     parameters: dict[str, Tensor], scene: Scene, config: GaussiansConfig
 ) -> dict[str, Tensor]:
-    """The first Gaussians and, behind them, round ones on a sphere around cameras and scene, where views look past every sparse point.
+    """The first Gaussians and, behind them, round ones on a sphere around cameras and scene.
 
-    A closed room with points on every wall gets none; nor does a scene without sparse points, where nothing is known to be empty.
-    Elsewhere the sphere is closed: directions that no view looks into have the colour of the nearest one that a view does.
+    A scene without sparse points gets none: its random ones are everywhere already.
 
     Args:
         parameters: From `initialise`.
@@ -51,30 +51,37 @@ def with_background(
 
 
 def background(scene: Scene, count: int) -> Cloud:
-    """Evenly spread points of the sphere and the mean colours of the views there; none where there is nothing to be seen past."""
+    """Evenly spread points of the sphere and the colours that training views have there.
+
+    A direction has the mean colour of the views that look past every sparse point there, if most that look into it do. Other
+    directions have the colour of the nearest such one: what hides the sky in them is not the colour of the sky. Where there is none at
+    all, in a room with points on every wall, the mean of all views that look into a direction has to do.
+    """
     points = scene.points.float()
     points = points[points.isfinite().all(dim=1)]
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
-    nothing = Cloud(points[:0], points[:0])
     if count == 0 or len(points) == 0:
-        return nothing
+        return Cloud(points[:0], points[:0])
     viewmats = torch.stack([view.camera.viewmat for view in scene.train]).float()
     middle = camera_center(viewmats).mean(dim=0)
     within = (points - middle).norm(dim=1).quantile(0.95).item()
     radius = max(CAMERA_SHARE * scene_extent(viewmats), POINT_SHARE * within)
     sphere = middle + radius * _directions(count)
-    seen, empty, color = torch.zeros(count), torch.zeros(count), torch.zeros(count, 3)
+    seen, past = torch.zeros(count), torch.zeros(count)
+    total, sky = torch.zeros(count, 3), torch.zeros(count, 3)
     for view in scene.train[:: -(-len(scene.train) // MAX_VIEWS)]:
         x, y, inside = _project(sphere, view.camera)
-        free = _beside_points(points, view.camera, x, y) & inside
+        pixels = view.read_image()[y[inside].long(), x[inside].long()].float() / 255.0
+        free = _beside_points(points, view.camera, x[inside], y[inside])
         seen += inside
-        empty += free
-        color[free] += view.read_image()[y[free].long(), x[free].long()].float() / 255.0
-    known = 2 * empty > seen
+        total[inside] += pixels
+        past[inside] += free
+        sky[inside] += pixels * free[:, None]
+    known = 2 * past > seen
     if not known.any():
-        return nothing
+        known, past, sky = seen > 0, seen, total
     nearest = torch.cdist(sphere, sphere[known]).argmin(dim=1)
-    return Cloud(sphere, (color[known] / empty[known][:, None])[nearest])
+    return Cloud(sphere, (sky[known] / past[known][:, None])[nearest])
 
 
 def _directions(count: int) -> Float[Tensor, "count 3"]:
@@ -99,7 +106,7 @@ def _project(
 def _beside_points(
     points: Float[Tensor, "n 3"], camera: Camera, x: Float[Tensor, " m"], y: Float[Tensor, " m"]
 ) -> Bool[Tensor, " m"]:
-    """Whether no sparse point lies in the square of a pixel or in one beside it; what is outside of the image may be anything."""
+    """Whether no sparse point lies in the square of a pixel, or in one beside it."""
     at_x, at_y, inside = _project(points, camera)
     cells = min(max(math.sqrt(int(inside.sum())) / 2, CELLS[0]), CELLS[1])
     size = max(camera.width, camera.height) / cells
@@ -107,6 +114,4 @@ def _beside_points(
     taken = torch.zeros(1, rows, columns)
     taken[0, (at_y[inside] / size).long(), (at_x[inside] / size).long()] = 1
     taken = max_pool2d(taken, 3, stride=1, padding=1)[0] > 0
-    row = (y / size).nan_to_num().clamp(0, rows - 1).long()
-    column = (x / size).nan_to_num().clamp(0, columns - 1).long()
-    return ~taken[row, column]
+    return ~taken[(y / size).long(), (x / size).long()]

@@ -74,8 +74,9 @@ class GaussiansConfig:
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
-    """Directions all around in which far Gaussians are placed where views look past every sparse point (`vlgs.gaussians.background`)."""
+    """Directions all around in which a far Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
     background_opacity: float = 0.5
+    """Of these at the start."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -94,8 +95,12 @@ class GaussiansConfig:
         if self.sh_degree not in range(4):
             raise ValueError(f"gaussians: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         _require_inside_unit(
-            "gaussians", init_opacity=self.init_opacity, init_indicator=self.init_indicator
+            "gaussians",
+            init_opacity=self.init_opacity,
+            init_indicator=self.init_indicator,
+            background_opacity=self.background_opacity,
         )
+        _require_at_least("gaussians", 0, background=self.background)
         _require_at_least("gaussians", 1, init_points=self.init_points, max_count=self.max_count)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {

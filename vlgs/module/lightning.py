@@ -263,7 +263,13 @@ class VLGSModule(L.LightningModule):
         if render.feature is None or target.codes is None:
             return torch.zeros(())
         feature = render.feature.view_as(target.codes)
-        return self.losses.language_loss(feature, target.codes, target.valid)
+        loss = self.losses.language_loss(feature, target.codes, target.valid)
+        if target.valid is None or self.losses.absent_weight == 0:
+            return loss
+        covered, absent = _covered(target.view), ~target.valid
+        if covered is not None:
+            absent &= covered.repeat_interleave(self.scene.mask_levels, dim=1)
+        return loss + self.losses.absent_loss(feature, absent)
 
     def _backward(
         self, total: Tensor, color_losses: list[Tensor], renders: list[ViewRender]
