@@ -15,7 +15,6 @@ from torch.nn.functional import max_pool2d
 from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.init import Cloud, parameters_of
 from vlgs.gaussians.neighbors import mean_squared_distance
-from vlgs.gaussians.parameters import logit
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
 
@@ -39,14 +38,13 @@ def with_background(
     Args:
         parameters: From `initialise`.
         scene: Its training views and sparse points.
-        config: `background` directions all around, and their opacity.
+        config: `background` directions all around.
     """
     sphere = background(scene, config.background)
     if len(sphere.points) == 0:
         return parameters
     scales = mean_squared_distance(sphere.points).sqrt()
     behind = parameters_of(sphere, scales, config, parameters["features"].shape[1])
-    behind["opacity_logits"].fill_(logit(config.background_opacity))
     return {name: torch.cat([value, behind[name]]) for name, value in parameters.items()}
 
 

@@ -75,8 +75,6 @@ class GaussiansConfig:
     """Random points for a scene without sparse points."""
     background: int = 1500
     """Directions all around in which a far Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
-    background_opacity: float = 0.5
-    """Of these at the start."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -98,7 +96,6 @@ class GaussiansConfig:
             "gaussians",
             init_opacity=self.init_opacity,
             init_indicator=self.init_indicator,
-            background_opacity=self.background_opacity,
         )
         _require_at_least("gaussians", 0, background=self.background)
         _require_at_least("gaussians", 1, init_points=self.init_points, max_count=self.max_count)
