@@ -34,9 +34,11 @@ def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_spread_is_over_seeds_and_worst_over_views():
     row = UnseenRow("a", "20 views", "default", 0, "r", 2, None, 30.0, 25.0, "v", 0.9, 0.5, None, 0.0, 100, 1.0)  # fmt: skip
     other = replace(row, seed=1, run="s", psnr=31.0, worst=22.0, miou=0.6)
-    line = summary([row, other]).iloc[0]
-    assert (line.psnr, line.psnr_spread, line.worst, line.seeds) == (30.5, 1.0, 22.0, 2)
+    (line,) = summary([row, other])
+    assert (line.seeds, line.psnr_spread) == (2, 1.0)
     assert line.miou_spread == pytest.approx(0.1)
+    assert (line.means["psnr"], line.means["worst"]) == (30.5, 22.0)
+    assert line.means["miou_lerf_ovs"] is None
 
 
 def test_photographs_that_are_not_there_are_left_out(tmp_path: Path):

@@ -5,8 +5,9 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
+from typing import Any, cast
 
-import pandas as pd
 import torch
 
 from vlgs.bench.lonely import share_lonely
@@ -179,34 +180,60 @@ def _read(path: Path) -> list[UnseenRow]:
         return []
     table = read_sheet(path).astype(object)
     lines = table.where(table.notna(), None).to_dict(orient="records")
-    return [UnseenRow(**{str(key): value for key, value in line.items()}) for line in lines]
+    return [UnseenRow(**cast(dict[str, Any], line)) for line in lines]
 
 
-def summary(rows: Sequence[UnseenRow]) -> pd.DataFrame:
-    """Mean over seeds and spread (largest minus smallest) of the seeds, per recipe, scene and split."""
-    table = pd.DataFrame([vars(row) for row in rows])
-    groups = table.groupby(["results_version", "recipe", "scene", "split"], sort=False)
-    numbers = table.columns[7:].drop("worst_view")
-    mean = groups[list(numbers)].agg(lambda values: values.astype(float).mean())
-    spread = groups[["psnr", "miou"]].agg(lambda values: float(values.max() - values.min()))
-    mean["worst"] = groups["worst"].min()
-    mean["seeds"] = groups["seed"].count()
-    return mean.join(spread.add_suffix("_spread")).reset_index()
+@dataclass(frozen=True)
+class Summary:
+    """A scene over its seeds."""
+
+    scene: str
+    split: str
+    recipe: str
+    results_version: int
+    seeds: int
+    means: Mapping[str, float | None]
+    """Means over seeds, by column of `UnseenRow`; `worst` is the worst of all."""
+    psnr_spread: float
+    """Largest minus smallest mean PSNR of the seeds, dB."""
+    miou_spread: float | None
+
+
+def summary(rows: Sequence[UnseenRow]) -> list[Summary]:
+    """One per results version, recipe, scene and split, in the order they came."""
+    groups: dict[tuple[int, str, str, str], list[UnseenRow]] = {}
+    for row in rows:
+        groups.setdefault((row.results_version, row.recipe, row.scene, row.split), []).append(row)
+    names = ("psnr", "ssim", "miou", "miou_lerf_ovs", "lonely", "gaussians", "cpu_seconds")
+    found = []
+    for (version, recipe, scene, split), mine in groups.items():
+        values = {name: [getattr(row, name) for row in mine] for name in names}
+        means = {name: None if None in them else fmean(them) for name, them in values.items()}
+        means["worst"] = min(row.worst for row in mine)
+        psnr, miou = values["psnr"], values["miou"]
+        spread = None if None in miou else max(miou) - min(miou)
+        found.append(
+            Summary(scene, split, recipe, version, len(mine), means, max(psnr) - min(psnr), spread)
+        )
+    return found
 
 
 def _print(rows: Sequence[UnseenRow]) -> None:
-    def number(value: float, digits: int) -> str:
-        return "--" if pd.isna(value) else f"{value:.{digits}f}"
+    def number(value: float | None, digits: int) -> str:
+        return "--" if value is None else f"{value:.{digits}f}"
 
-    lines = [
-        (
-            line.scene, line.split, f"{line.recipe}, {line.results_version}", f"{line.seeds}", number(line.psnr, 2),
-            number(line.psnr_spread, 2), number(line.worst, 2), number(line.ssim, 3), number(line.miou, 3),
-            number(line.miou_spread, 3), number(line.miou_lerf_ovs, 3), number(100 * line.lonely, 1),
-            f"{line.gaussians:.0f}", f"{line.cpu_seconds:.0f}",
-        )
-        for line in summary(rows).itertuples()
-    ]  # fmt: skip
+    lines = []
+    for s in summary(rows):
+        m = s.means
+        assert m["lonely"] is not None
+        lines.append(
+            (
+                s.scene, s.split, f"{s.recipe}, {s.results_version}", f"{s.seeds}", number(m["psnr"], 2),
+                number(s.psnr_spread, 2), number(m["worst"], 2), number(m["ssim"], 3), number(m["miou"], 3),
+                number(s.miou_spread, 3), number(m["miou_lerf_ovs"], 3), number(100 * m["lonely"], 1),
+                number(m["gaussians"], 0), number(m["cpu_seconds"], 0),
+            )
+        )  # fmt: skip
     columns = (
         "scene",
         "trained on",
