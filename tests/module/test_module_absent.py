@@ -12,8 +12,8 @@ from vlgs.module.build import Parts, build_module
 
 def lengths(weight: float) -> tuple[float, float]:
     """Mean length of the rendered codes outside and inside of the masks of a training view under a sky, after a short training."""
-    given = ("trainer=smoke", "data.scene=mirrors_sky", "data.cache=null", "fusion=none")
-    config = composed(*TINY, *given, f"loss.absent_weight={weight}")
+    given = ("trainer=smoke", "data.scene=mirrors_sky", "fusion=none", "gaussians.background=300")
+    config = composed(*TINY, *given, "data.cache=null", f"loss.absent_weight={weight}")
     torch.manual_seed(0)
     parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
     module = build_module(instantiate(config.data), parts, 0)

@@ -39,12 +39,13 @@ def load_scene(
     The same arguments give the same bits on one machine. See `vlgs.data.synthetic` for what the scenes are.
 
     Args:
-        scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``.
+        scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``; with ``_ring``, ``_sky`` or ``_wall`` after it, seen from there.
         difficulty: ``easy``, or ``hard``: half as many things again, occlusion, about twice the faults.
         width: Pixels.
         height: Pixels; the field of view is fixed horizontally.
         train_views: Photographs with language supervision, evenly spaced along the walk.
-        test_views: Held-out photographs, each halfway between two training ones; fewer than `train_views`.
+        test_views: Held-out photographs, each halfway between two training ones (or as `vlgs.data.synthetic.outdoors` has it); fewer
+            than `train_views`.
         seed: Of placement, hand shake, points and faults. Words have their vectors whatever the seed.
         points: Sparse points drawn; about a tenth is lost on glass and steel.
         level: Mask level of the supervision: 0 default, 1 subpart, 2 part, 3 whole.
