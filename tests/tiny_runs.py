@@ -11,6 +11,7 @@ TINY = (
     "data.train_views=6",
     "data.test_views=2",
     "data.points=400",
+    "gaussians.background=0",
     "codec.training.steps=30",
     "codec.cache_dir=null",
     "progress=false",

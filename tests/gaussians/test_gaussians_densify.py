@@ -152,6 +152,19 @@ def test_large_ones_go_only_after_the_first_reset():
     assert run(never, state_of([COLD] * 40), config, step=LATE).pruned == 0
 
 
+def test_a_background_may_be_large():
+    params = make(40, LARGE)
+    with torch.no_grad():
+        params["means"][:20] = (
+            torch.nn.functional.normalize(params["means"][:20], dim=1) * 9 * EXTENT
+        )
+        params["means"][20:] *= 0.1
+    state, centers = state_of([COLD] * 40), torch.zeros(3, 3)
+    report = densify(params, adam(params), state, GaussiansConfig(), EXTENT, 0, LATE, centers)
+    assert report.pruned == 20
+    assert params["means"].norm(dim=1).min() > 8
+
+
 @pytest.mark.parametrize("name", PARAMETERS)
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 def test_broken_gaussians_are_removed(name: str, poison: float):

@@ -128,6 +128,29 @@ def train(parser: ArgumentParser) -> Runner:
     return run
 
 
+def unseen(parser: ArgumentParser) -> Runner:
+    """Views between, beyond and above the training views, few views, skies, plain walls; what has a row is not trained again."""
+    parser.add_argument("--scenes", nargs="+", help="default: all of vlgs/bench/unseen.py")
+    parser.add_argument("--views", type=int, nargs="+", default=[12, 20, 40], help="to train on")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--root", type=Path, help="folder of the scenes of photographs")
+    parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
+    parser.add_argument("--recipe", default="default", help="a name for what --override changes")
+    parser.add_argument("--override", nargs="+", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--train-threads", type=int, default=1)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.unseen import PHOTOGRAPHS, PROCEDURAL, make_tasks, run_unseen
+
+        scenes = args.scenes or [*PROCEDURAL, *PHOTOGRAPHS]
+        views, seeds = ([4], [args.seed]) if args.quick else (args.views, args.seeds)
+        tasks = make_tasks(scenes, views, args.root, args.resize, args.quick)
+        run_unseen(tasks, {args.recipe: args.override}, seeds, args.out, args.train_threads)
+        return 0
+
+    return run
+
+
 def overhead(parser: ArgumentParser) -> Runner:
     """What the Trainer adds to an iteration."""
     parser.add_argument("--iterations", type=int, default=300)
@@ -252,6 +275,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     pareto,
     growth,
     train,
+    unseen,
     overhead,
     iteration,
     reading,

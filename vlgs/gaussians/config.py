@@ -75,6 +75,8 @@ class GaussiansConfig:
     """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (systems.md D.9, F.4)."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
+    background: int = 1500
+    """Directions all around in which a far Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -93,11 +95,14 @@ class GaussiansConfig:
         if self.sh_degree not in range(4):
             raise ValueError(f"gaussians: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         _require_inside_unit(
-            "gaussians", init_opacity=self.init_opacity, init_indicator=self.init_indicator
+            "gaussians",
+            init_opacity=self.init_opacity,
+            init_indicator=self.init_indicator,
         )
         # Many more have no place in memory; random ones are drawn by the dozen and the best are kept.
         require_range("gaussians", 1, 10**7, init_points=self.init_points)
         require_range("gaussians", 1, 10**9, max_count=self.max_count)
+        require_range("gaussians", 0, 10**6, background=self.background)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from vlgs.gaussians.config import GaussiansConfig
-from vlgs.gaussians.init import seeded_generator
+from vlgs.gaussians.init import distance_to_nearest, seeded_generator
 from vlgs.gaussians.parameters import logit
 from vlgs.geometry import quat_to_rotmat
 
@@ -20,6 +20,8 @@ CHILDREN = 2
 """Gaussians that a split one is replaced by."""
 SHRINK = 1.6
 """Their scales are the parent's divided by this (3DGS: 0.8 times the number of children)."""
+BACKGROUND = 4.0
+"""What is more scene extents away from every training camera is a background, which may be as large as it is far."""
 MIN_COUNT = 16
 """Pruning leaves at least this many, so that a bad step cannot end a run with an empty scene."""
 
@@ -102,6 +104,7 @@ def densify(
     extent: float,
     seed: int,
     step: int,
+    centers: Float[Tensor, "v 3"] | None = None,
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
@@ -117,6 +120,7 @@ def densify(
         extent: `vlgs.geometry.scene_extent` of the training cameras, world units.
         seed: Of the run.
         step: Of the run; large Gaussians are spared until the first opacity reset has passed.
+        centers: Of the training cameras; what is `BACKGROUND` away from all of them may be large. None: nothing may.
 
     Raises:
         ValueError: If `state` has another size than `params`, or no Gaussian is finite.
@@ -132,7 +136,7 @@ def densify(
         rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
         values = {name: value[rows.source] for name, value in params.items()}
         _place_children(values, rows, seeded_generator("densify", seed, step))
-        kept = _not_large(_largest_scale(values), config, extent, step)
+        kept = _not_large(values, config, extent, step, centers)
         if not kept.all():
             rows, values = rows[kept], {name: value[kept] for name, value in values.items()}
     _replace(params, optimizer, values, rows)
@@ -243,17 +247,24 @@ def _largest_scale(params: nn.ParameterDict | Mapping[str, Tensor]) -> Float[Ten
 
 
 def _not_large(
-    largest: Float[Tensor, " n"], config: GaussiansConfig, extent: float, step: int
+    values: Mapping[str, Tensor],
+    config: GaussiansConfig,
+    extent: float,
+    step: int,
+    centers: Float[Tensor, "v 3"] | None,
 ) -> Bool[Tensor, " n"]:
     """Gaussians that stay, once large ones are looked for.
 
     3DGS also names a radius of 20 px on the screen; its code as released clears the radii just before it looks at
-    them, so that only the size in the world ever counted. That is what is done here.
+    them, so that only the size in the world ever counted. That is what is done here, but a background may be large.
     """
-    first_reset = config.densify.reset_every
+    largest, first_reset = _largest_scale(values), config.densify.reset_every
     if not config.densify.prune_large or first_reset == 0 or step <= first_reset:
         return torch.ones_like(largest, dtype=torch.bool)
-    return ~_spare(largest > config.densify.max_scale_share * extent, -largest)
+    large = largest > config.densify.max_scale_share * extent
+    if centers is not None:
+        large &= distance_to_nearest(values["means"].float(), centers) < BACKGROUND * extent
+    return ~_spare(large, -largest)
 
 
 def _replace(

@@ -30,7 +30,9 @@ DEPTHS = (0.1, 10.0)
 
 
 @dataclass(frozen=True)
-class _Cloud:
+class Cloud:
+    """Points with their colours in [0, 1]."""
+
     points: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
 
@@ -61,18 +63,18 @@ def initialise(
     cameras = [view.camera for view in scene.train]
     centers = camera_center(torch.stack([camera.viewmat for camera in cameras])).float()
     generator = seeded_generator("initialise", seed, 0)
-    cloud = _usable(_Cloud(scene.points.float(), scene.point_colors.float() / 255.0), centers)
+    cloud = _usable(Cloud(scene.points.float(), scene.point_colors.float() / 255.0), centers)
     if cloud.points.shape[0] == 0:
         log.info("%s has no usable sparse points: %d random ones", scene.name, config.init_points)
         points = _random_points(cameras, min(config.init_points, config.max_count), generator)
-        cloud = _Cloud(points, torch.full_like(points, 0.5))
+        cloud = Cloud(points, torch.full_like(points, 0.5))
     elif cloud.points.shape[0] > config.max_count:
         log.info("%d of %d sparse points kept", config.max_count, cloud.points.shape[0])
         kept = torch.randperm(cloud.points.shape[0], generator=generator)[
             : config.max_count
         ].sort()[0]
-        cloud = _Cloud(cloud.points[kept], cloud.colors[kept])
-    return _parameters(cloud, _initial_scales(cloud.points, centers, config), config, feature_dim)
+        cloud = Cloud(cloud.points[kept], cloud.colors[kept])
+    return parameters_of(cloud, _initial_scales(cloud.points, centers, config), config, feature_dim)
 
 
 def seeded_generator(purpose: str, seed: int, step: int) -> torch.Generator:
@@ -84,9 +86,10 @@ def seeded_generator(purpose: str, seed: int, step: int) -> torch.Generator:
     return torch.Generator().manual_seed(int.from_bytes(digest, "little"))
 
 
-def _parameters(
-    cloud: _Cloud, scales: Float[Tensor, " n"], config: GaussiansConfig, feature_dim: int
+def parameters_of(
+    cloud: Cloud, scales: Float[Tensor, " n"], config: GaussiansConfig, feature_dim: int
 ) -> dict[str, Tensor]:
+    """Raw parameters of round Gaussians of these scales."""
     n = cloud.points.shape[0]
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
@@ -102,13 +105,13 @@ def _parameters(
     }
 
 
-def _usable(cloud: _Cloud, centers: Float[Tensor, "v 3"]) -> _Cloud:
+def _usable(cloud: Cloud, centers: Float[Tensor, "v 3"]) -> Cloud:
     finite = (cloud.points.abs() <= MAX_COORDINATE).all(dim=1)  # false for NaN
     points, colors = cloud.points[finite], cloud.colors[finite]
     points, first = _without_duplicates(points)
     colors = colors[first]
-    clear = _distance_to_nearest(points, centers) >= MIN_CAMERA_DISTANCE
-    return _Cloud(points[clear], colors[clear])
+    clear = distance_to_nearest(points, centers) >= MIN_CAMERA_DISTANCE
+    return Cloud(points[clear], colors[clear])
 
 
 def _without_duplicates(
@@ -122,9 +125,10 @@ def _without_duplicates(
     return points[first], first
 
 
-def _distance_to_nearest(
+def distance_to_nearest(
     points: Float[Tensor, "n 3"], centers: Float[Tensor, "v 3"]
 ) -> Float[Tensor, " n"]:
+    """Distance of every point to the nearest centre."""
     # In chunks, and without the matrix product that loses small distances to cancellation.
     exact = "donot_use_mm_for_euclid_dist"
     chunks = points.split(1 << 14)
@@ -135,7 +139,7 @@ def _initial_scales(
     points: Float[Tensor, "n 3"], centers: Float[Tensor, "v 3"], config: GaussiansConfig
 ) -> Float[Tensor, " n"]:
     scales = mean_squared_distance(points).clamp_min(MIN_SQUARED_DISTANCE).sqrt()
-    return scales.minimum(config.max_init_angle * _distance_to_nearest(points, centers))
+    return scales.minimum(config.max_init_angle * distance_to_nearest(points, centers))
 
 
 def _random_points(

@@ -12,6 +12,7 @@ from vlgs.codec.autoencoder import Autoencoder
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, initialise
+from vlgs.gaussians.background import with_background
 from vlgs.gaussians.parameters import with_language_shape, with_level_indicators
 from vlgs.indicator import Indicator, PerLevel
 from vlgs.interchange import load_weights, start_from
@@ -76,7 +77,7 @@ def build_module(
     if start is not None:
         parameters = dict(start)
     elif config.init is None:
-        parameters = initialise(scene, config, width, seed)
+        parameters = with_background(initialise(scene, config, width, seed), scene, config)
     else:
         parameters = start_from(config.init, config, width)
     language = scene.mask_vectors.shape[0] > 0

@@ -52,6 +52,7 @@ class Densification(L.Callback):
                 module.extent,
                 module.seed,
                 done,
+                module.centers,
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)

@@ -15,7 +15,7 @@ from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import DensifyState, GaussiansConfig
-from vlgs.geometry import scene_extent
+from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
 from vlgs.module.blended import BlendPlan, CamerasBetween, plan_blend
 from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
@@ -103,7 +103,8 @@ class VLGSModule(L.LightningModule):
             near = nearest_views([view.camera for view in scene.train], blend.neighbours)
         self.sampler = PairSampler(sizes, seed, near)
         self.between = CamerasBetween(self.sampler, [v.camera for v in scene.train], blend)
-        self.extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
+        viewmats = torch.stack([view.camera.viewmat for view in scene.train])
+        self.extent, self.centers = scene_extent(viewmats), camera_center(viewmats).float()
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
         self.target_cache = PixelCache(self._room_for_targets())
@@ -262,7 +263,13 @@ class VLGSModule(L.LightningModule):
         if render.feature is None or target.codes is None:
             return torch.zeros(())
         feature = render.feature.view_as(target.codes)
-        return self.losses.language_loss(feature, target.codes, target.valid)
+        loss = self.losses.language_loss(feature, target.codes, target.valid)
+        if target.valid is None or self.losses.absent_weight == 0:
+            return loss
+        covered, absent = _covered(target.view), ~target.valid
+        if covered is not None:
+            absent &= covered.repeat_interleave(self.scene.mask_levels, dim=1)
+        return loss + self.losses.absent_loss(feature, absent)
 
     def _backward(
         self, total: Tensor, color_losses: list[Tensor], renders: list[ViewRender]

@@ -9,6 +9,7 @@ import numpy as np
 
 from vlgs.data.synthetic import props_matte as matte
 from vlgs.data.synthetic import props_shiny as shiny
+from vlgs.data.synthetic.outdoors import STAGES, name_parts, surroundings
 from vlgs.data.synthetic.patterns import Bands, Cells, Plain, Wood
 from vlgs.data.synthetic.shapes import Box, cylinder
 from vlgs.data.synthetic.things import Material, Part, Thing, place
@@ -103,6 +104,8 @@ HARD: dict[str, tuple[Spot, ...]] = {
 }
 
 SCENES = tuple(EASY)
+STAGED = tuple(f"{layout}_{stage}" for layout in SCENES for stage in STAGES)
+"""The same tables, seen from a ring or an arc, with views between, beyond and above it held out (`vlgs.data.synthetic.outdoors`)."""
 DIFFICULTIES = ("easy", "hard")
 
 
@@ -111,12 +114,15 @@ def build(scene: str, difficulty: str, rng: np.random.Generator) -> tuple[Thing,
 
     Another seed moves every thing by up to 1 cm and turns it by up to 12 degrees: a sibling of the scene, not a copy.
     """
-    spots = (EASY if difficulty == "easy" else HARD)[scene]
+    layout, stage = name_parts(scene)
+    spots = (EASY if difficulty == "easy" else HARD)[layout]
     things = []
     for make, x, y, degrees in spots:
         dx, dy, turned = rng.uniform(-1, 1, 3) * (0.01, 0.01, 12.0)
         things.append(place(make(), x + float(dx), y + float(dy), degrees + float(turned)))
-    return (*things, _table(), _wall(), _floor())
+    if stage in (None, "ring"):
+        return (*things, _table(), _wall(), _floor())
+    return (*things, _table(), *surroundings(stage, FLOOR))
 
 
 def _table() -> Thing:

@@ -93,7 +93,7 @@ def view_masks(
 
     Args:
         regions: Level in 1 to 3 -> exact region number per pixel.
-        names: Level -> region number -> what it is.
+        names: Level -> region number -> what it is; a region without a name is never found.
         words: Classes that a mask may be mislabelled as.
         faults: Resolved rates.
         key: Seed, scene and number of the view: what the draws are functions of, besides the mask.
@@ -135,6 +135,9 @@ def _level_masks(
         bounds, draws[:, 0], side="right"
     )  # 0 missed, 1 merged, 2 mislabelled, 3 sound
     present &= fate != 0
+    present &= np.array(
+        [int(n) in names for n in numbers]
+    )  # others are nothing that could be found
     group = _merge(local, present, fate == 1, draws[:, 1])
 
     vectors = np.zeros((numbers.size, WIDTH))

@@ -53,6 +53,25 @@ class Plain:
 
 
 @dataclass(frozen=True)
+class Gradient:
+    """From one colour to another along the z axis, with nothing to hold on to; one patch."""
+
+    low: Color
+    high: Color
+    start: float
+    """Height up to which the first colour is pure."""
+    end: float
+    """Height from which the second one is."""
+
+    def __call__(self, point: Float[np.ndarray, "3 n"]) -> Painted:
+        """See `Pattern`."""
+        share = np.clip((point[2] - self.start) / (self.end - self.start), 0.0, 1.0)
+        share = share * share * (3 - 2 * share)  # without an edge at either end
+        low, high = np.array(self.low)[:, None], np.array(self.high)[:, None]
+        return low + (high - low) * share, np.zeros(point.shape[1], np.uint16)
+
+
+@dataclass(frozen=True)
 class Bands:
     """Stripes across the z axis, from `start` upwards; what lies below belongs to the first."""
 

@@ -3,7 +3,8 @@
 import hashlib
 from dataclasses import astuple, dataclass, field, replace
 
-from vlgs.data.synthetic.layouts import DIFFICULTIES, SCENES
+from vlgs.data.synthetic import outdoors
+from vlgs.data.synthetic.layouts import DIFFICULTIES, SCENES, STAGED
 from vlgs.data.synthetic.masks import Faults
 
 VERSION = 1
@@ -28,7 +29,7 @@ class Recipe:
 
     def __post_init__(self):
         for name, value, options in (
-            ("scene", self.scene, SCENES),
+            ("scene", self.scene, (*SCENES, *STAGED)),
             ("difficulty", self.difficulty, DIFFICULTIES),
         ):
             if value not in options:
@@ -52,4 +53,6 @@ class Recipe:
         """Hash of the parameters, with faults as they come out, and of the generator's version."""
         resolved = replace(self, faults=self.faults.resolve(self.difficulty))
         text = f"vlgs.data.synthetic {VERSION} {astuple(resolved)} {level}"
+        if self.scene in STAGED:
+            text += f" outdoors {outdoors.VERSION}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

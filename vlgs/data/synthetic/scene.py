@@ -39,12 +39,13 @@ def load_scene(
     The same arguments give the same bits on one machine. See `vlgs.data.synthetic` for what the scenes are.
 
     Args:
-        scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``.
+        scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``; with ``_ring``, ``_sky`` or ``_wall`` after it, seen from there.
         difficulty: ``easy``, or ``hard``: half as many things again, occlusion, about twice the faults.
         width: Pixels.
         height: Pixels; the field of view is fixed horizontally.
         train_views: Photographs with language supervision, evenly spaced along the walk.
-        test_views: Held-out photographs, each halfway between two training ones; fewer than `train_views`.
+        test_views: Held-out photographs, each halfway between two training ones (or as `vlgs.data.synthetic.outdoors` has it); fewer
+            than `train_views`.
         seed: Of placement, hand shake, points and faults. Words have their vectors whatever the seed.
         points: Sparse points drawn; about a tenth is lost on glass and steel.
         level: Mask level of the supervision: 0 default, 1 subpart, 2 part, 3 whole.
@@ -82,7 +83,7 @@ def load_scene(
         mask_vectors=torch.from_numpy(np.concatenate(vectors)),
         mask_areas=torch.from_numpy(areas).float(),
         classes=studio.classes,
-        class_kinds={thing.name: thing.kind for thing in studio.world.things},
+        class_kinds={thing.name: thing.kind for thing in studio.world.things if thing.masked},
         vocabulary=vocabulary(studio.classes),
         supervise=lambda camera, number: _supervise(recipe, folder, level, camera, number),
         fingerprint=recipe.fingerprint(level),

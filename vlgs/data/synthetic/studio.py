@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from vlgs.data.synthetic.cameras import camera_at, moments
+from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
 from vlgs.data.synthetic.layouts import build
 from vlgs.data.synthetic.masks import NO_FAULTS, Region
+from vlgs.data.synthetic.outdoors import name_parts
 from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.recipe import Recipe
 from vlgs.data.synthetic.world import World
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.files import write_atomically
-from vlgs.types import Camera
+from vlgs.types import IGNORE_ID, Camera
 
 log = logging.getLogger(__name__)
 
@@ -61,8 +62,11 @@ def open_studio(recipe: Recipe, cache: Path | None = None) -> Studio:
 def _open(recipe: Recipe, cache: Path | None) -> Studio:
     things = build(recipe.scene, recipe.difficulty, np.random.default_rng([_LAYOUT, recipe.seed]))
     world = World(things)
-    classes = tuple(dict.fromkeys(thing.name for thing in things))
-    class_of_thing = np.array([classes.index(thing.name) for thing in things], np.uint8)
+    classes = tuple(dict.fromkeys(thing.name for thing in things if thing.masked))
+    class_of_thing = np.array(
+        [classes.index(thing.name) if thing.masked else IGNORE_ID for thing in things], np.uint8
+    )
+    _, stage = name_parts(recipe.scene)
     train, test = moments(recipe.train_views, recipe.test_views)
     order = np.argsort(np.argsort(np.concatenate([train, test])))
     places = []
@@ -72,7 +76,11 @@ def _open(recipe: Recipe, cache: Path | None) -> Studio:
         held_out = len(places) >= recipe.train_views
         number = len(places) - recipe.train_views * held_out
         rng = np.random.default_rng([_WALK, recipe.seed, int(held_out), number])
-        camera = camera_at(moment, rng, recipe.width, recipe.height)
+        if stage is None:
+            camera = camera_at(moment, rng, recipe.width, recipe.height)
+        else:
+            stop = stop_at(stage, number, recipe.train_views, recipe.test_views if held_out else 0)
+            camera = held(stop, rng, recipe.width, recipe.height)
         places.append((f"frame_{position + 1:05d}", number, camera))
     photos = _photographs(world, [camera for *_, camera in places], recipe, cache)
     shots = [Shot(n, k, c, photo) for (n, k, c), photo in zip(places, photos, strict=True)]
@@ -115,6 +123,7 @@ def regions(
     """Region number per pixel, and what the regions are, at levels 1 (subpart), 2 (part) and 3 (whole)."""
     part = photo.part.astype(np.int64)
     numbers = {3: world.thing_of_part[part], 2: part, 1: part * _PATCHES + photo.patch}
+    findable = np.array([thing.masked for thing in world.things])[numbers[3]]
     place = np.concatenate([np.arange(len(thing.parts)) for thing in world.things])
 
     def region(level: int, number: int) -> Region:
@@ -125,7 +134,7 @@ def regions(
         return Region(word, f"{word}, part {place[part]}, patch {patch}")
 
     names = {
-        level: {n: region(level, n) for n in np.unique(found).tolist()}
+        level: {n: region(level, n) for n in np.unique(found[findable]).tolist()}
         for level, found in numbers.items()
     }
     return numbers, names

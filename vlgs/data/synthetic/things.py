@@ -54,6 +54,8 @@ class Thing:
     """`TRANSLUCENT_REFLECTIVE` or `OTHER`."""
     background: bool = False
     """Table, walls and floor: every pixel has a class, but these are not asked for."""
+    masked: bool = True
+    """Off: no segmenter finds it and it is no class, as the sky."""
 
 
 def turn(axis: Literal["x", "y", "z"], degrees: float) -> tuple[tuple[float, float, float], ...]:

@@ -1,0 +1,62 @@
+"""The yardstick of unseen views: a row per run, trained once."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from vlgs.bench import unseen
+from vlgs.bench.__main__ import main
+from vlgs.bench.lonely import share_lonely, view_weights
+from vlgs.bench.presets import train_a_little
+from vlgs.bench.sheet import read_sheet
+from vlgs.bench.unseen import QUICK, UnseenRow, make_tasks, summary
+
+
+def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    command = ["unseen", "--quick", "--scenes", "mirrors_sky", "--out", str(tmp_path)]
+    short = ["--override", "trainer.iterations=6", "data.cache=null"]
+    assert main([*command, *short]) == 0
+    table = read_sheet(tmp_path / "unseen.csv")
+    assert list(table.scene) == ["mirrors_sky"]
+    assert (table.worst <= table.psnr).all()
+    assert table.lonely.between(0, 1).all()
+    assert (tmp_path / "unseen.png").stat().st_size > 0
+    header = (tmp_path / "unseen.csv").read_text().splitlines()
+    assert {"# commit", "# cpu", "# command"} <= {line.partition(":")[0] for line in header}
+
+    monkeypatch.setattr(unseen, "fit", lambda *_: pytest.fail("trained again"))
+    assert main([*command, *short]) == 0
+    assert len(read_sheet(tmp_path / "unseen.csv")) == 1
+
+
+def test_spread_is_over_seeds_and_worst_over_views():
+    row = UnseenRow("a", "20 views", "default", 0, "r", 2, None, 30.0, 25.0, "v", 0.9, 0.5, None, 0.0, 100, 1.0)  # fmt: skip
+    other = replace(row, seed=1, run="s", psnr=31.0, worst=22.0, miou=0.6)
+    (line,) = summary([row, other])
+    assert (line.seeds, line.psnr_spread) == (2, 1.0)
+    assert line.miou_spread == pytest.approx(0.1)
+    assert (line.means["psnr"], line.means["worst"]) == (30.5, 22.0)
+    assert line.means["miou_lerf_ovs"] is None
+
+
+def test_photographs_that_are_not_there_are_left_out(tmp_path: Path):
+    tasks = make_tasks(["mirrors_sky", "fox"], [20], tmp_path, 0.5, quick=False)
+    assert [task.scene for task in tasks] == ["mirrors_sky"]
+    with pytest.raises(ValueError, match="scenes must be at least one that is there"):
+        make_tasks(["fox"], [20], tmp_path, 0.5, quick=False)
+
+
+def test_lonely_gaussians_are_those_that_training_views_do_not_see():
+    trained = train_a_little([*QUICK, "data.train_views=4", "data.test_views=2", "data.cache=null", "codec.cache_dir=null"], 1)  # fmt: skip
+    model, scene = trained.module.model, trained.scene
+    camera = scene.train[0].camera
+    weights = view_weights(model, camera)
+    alpha = model.render(camera, language=False).alpha_color
+    assert alpha is not None
+    torch.testing.assert_close(weights.sum(), alpha.sum(), rtol=1e-4, atol=0)
+    alone = replace(scene, train=scene.train[:1])
+    # One training view makes every Gaussian lonely; what is not covered at all does not count.
+    assert share_lonely(model, scene) <= share_lonely(model, alone)
+    assert share_lonely(model, alone) > 0.1

@@ -1,0 +1,249 @@
+"""Quality where nobody stood: views between, beyond and above the training views, few views, skies and plain walls."""
+
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any, cast
+
+import torch
+
+from vlgs.bench.lonely import share_lonely
+from vlgs.bench.presets import Trained, build, composed
+from vlgs.bench.quality import score
+from vlgs.bench.sheet import provenance, read_sheet, say, show, write_sheet
+from vlgs.bench.unseen_draw import draw_unseen
+from vlgs.config import RESULTS_VERSION, instantiate, run_id
+from vlgs.module.fit import FitOptions, fit
+from vlgs.report.provenance import commit
+from vlgs.runs import RunFolder
+
+PROCEDURAL = ("glassware_ring", "mirrors_sky", "lookalikes_wall")
+"""In a room, under a sky, before a plain wall."""
+TRAIN_VIEWS = (12, 20, 40)
+PHOTOGRAPHS = ("fox", "dtu_scan65", "camvid_0016E5")
+"""Folders below `--root`; a folder that is not there is left out."""
+HELD_OUT = 8
+SIZE = ("data.width=120", "data.height=90")
+QUICK = ("data.width=48", "data.height=36", "data.points=400", "codec.training.steps=30", "trainer=smoke")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class UnseenRow:
+    """One line of unseen.csv: one training."""
+
+    scene: str
+    split: str
+    """``20 views``, or of photographs ``every 8th`` or ``a tenth``: what was held out."""
+    recipe: str
+    seed: int
+    run: str
+    """Its id: a row that has it is not trained again."""
+    results_version: int
+    commit: str | None
+    psnr: float
+    """dB, mean over the held-out views."""
+    worst: float
+    """dB, of the worst held-out view."""
+    worst_view: str
+    ssim: float
+    miou: float | None
+    """Headline: the argmax over the classes, where every pixel has one."""
+    miou_lerf_ovs: float | None
+    """Words against the whole picture, skies included."""
+    lonely: float
+    """Share of the held-out pixels that are covered by Gaussians that fewer than two training views see (`share_lonely`)."""
+    gaussians: int
+    cpu_seconds: float
+    """Of the training, over all threads."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is trained, up to the seed and the recipe."""
+
+    scene: str
+    split: str
+    overrides: tuple[str, ...]
+
+
+def make_tasks(
+    scenes: Sequence[str], views: Sequence[int], root: Path | None, resize: float, quick: bool
+) -> list[Task]:
+    """Procedural scenes at every number of views; photographs below `root`, with two ways of holding out.
+
+    Raises:
+        ValueError: If nothing is left.
+    """
+    small = QUICK if quick else SIZE
+    tasks = [
+        Task(scene, f"{count} views", (
+            f"data.scene={scene}", f"data.train_views={count}", f"data.test_views={min(HELD_OUT, count - 1)}", *small))
+        for scene in scenes if scene not in PHOTOGRAPHS
+        for count in views
+    ]  # fmt: skip
+    for scene in (s for s in scenes if s in PHOTOGRAPHS and root is not None):
+        assert root is not None
+        if not (root / scene).is_dir():
+            say(f"{scene}: not below {root}; left out")
+            continue
+        given = ("data=colmap", f"data.root={root / scene}", f"data.resize={resize}")
+        given += QUICK[-1:] if quick else ("trainer=photos",)
+        tenth = ",".join(_middle_tenth([*given, "data.split=all"]))
+        tasks.append(Task(scene, "every 8th", (*given, "data.split=llff")))
+        tasks.append(Task(scene, "a tenth", (*given, "data.split=list", f"data.test=[{tenth}]")))
+    if not tasks:
+        raise ValueError(f"bench: scenes must be at least one that is there, got {list(scenes)}")
+    return tasks
+
+
+def run_unseen(
+    tasks: Sequence[Task],
+    recipes: Mapping[str, Sequence[str]],
+    seeds: Sequence[int],
+    out: Path,
+    threads: int,
+) -> list[UnseenRow]:
+    """Train what has no row yet, seed by seed; write unseen.csv after each, then unseen.png and the table.
+
+    Args:
+        tasks: From `make_tasks`.
+        recipes: Label -> overrides.
+        seeds: Of the training; the scenes stay the same.
+        out: Folder of the files.
+        threads: Of the training.
+    """
+    header = provenance(None, seeds=" ".join(map(str, seeds)), training_threads=threads)
+    path = out / "unseen.csv"
+    rows = _read(path)
+    torch.set_num_threads(threads)
+    for seed in seeds:
+        for task in tasks:
+            for label, overrides in recipes.items():
+                row = _row(task, label, overrides, seed, threads, {r.run: r for r in rows})
+                if row is not None:
+                    rows.append(row)
+                    write_sheet(path, rows, header)
+    draw_unseen(out / "unseen", rows)
+    _print(rows)
+    return rows
+
+
+def _row(
+    task: Task,
+    label: str,
+    overrides: Sequence[str],
+    seed: int,
+    threads: int,
+    known: Mapping[str, UnseenRow],
+) -> UnseenRow | None:
+    """Train and score, unless a row of this run is known."""
+    given = ["codec.cache_dir=null", *task.overrides, *overrides]
+    config = composed([*given, f"seed={seed}", f"threads={threads}", "progress=false"])
+    scene = instantiate(config.data)
+    run = run_id(config, scene.fingerprint)
+    if run in known:
+        return None
+    started = time.process_time()
+    trained = Trained(config, scene, build(config, scene))
+    with tempfile.TemporaryDirectory() as folder:
+        if fit(trained.module, RunFolder(Path(folder)), FitOptions({}, progress=False)) is not None:
+            raise KeyboardInterrupt
+    seconds = time.process_time() - started
+    scores = score(trained)
+    assert scores.psnr is not None
+    assert scores.ssim is not None
+    views = {name: float(view["psnr"] or 0.0) for name, view in scores.per_view.items()}
+    worst = min(views, key=lambda name: views[name])
+    lerf = scores.beside.get("miou_lerf_ovs")
+    row = UnseenRow(
+        task.scene, task.split, label, seed, run, RESULTS_VERSION, commit(), scores.psnr, views[worst], worst,
+        scores.ssim, scores.miou, None if lerf is None else float(lerf), share_lonely(trained.module.model, scene),
+        trained.module.model.count, seconds,
+    )  # fmt: skip
+    say(f"{task.scene}, {task.split}, {label}, seed {seed}: {row.psnr:.2f} dB, worst {row.worst:.2f}, "
+        f"mIoU {row.miou}, {row.gaussians} Gaussians, {seconds:.0f} s of CPU")  # fmt: skip
+    return row
+
+
+def _middle_tenth(overrides: Sequence[str]) -> list[str]:
+    names = sorted(view.name for view in instantiate(composed(overrides).data).train)
+    count = max(1, len(names) // 10)
+    first = (len(names) - count) // 2
+    return names[first : first + count]
+
+
+def _read(path: Path) -> list[UnseenRow]:
+    if not path.is_file():
+        return []
+    table = read_sheet(path).astype(object)
+    lines = table.where(table.notna(), None).to_dict(orient="records")
+    return [UnseenRow(**cast(dict[str, Any], line)) for line in lines]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A scene over its seeds."""
+
+    scene: str
+    split: str
+    recipe: str
+    results_version: int
+    seeds: int
+    means: Mapping[str, float | None]
+    """Means over seeds, by column of `UnseenRow`; `worst` is the worst of all."""
+    psnr_spread: float
+    """Largest minus smallest mean PSNR of the seeds, dB."""
+    miou_spread: float | None
+
+
+def summary(rows: Sequence[UnseenRow]) -> list[Summary]:
+    """One per results version, recipe, scene and split, in the order they came."""
+    groups: dict[tuple[int, str, str, str], list[UnseenRow]] = {}
+    for row in rows:
+        groups.setdefault((row.results_version, row.recipe, row.scene, row.split), []).append(row)
+    names = ("psnr", "ssim", "miou", "miou_lerf_ovs", "lonely", "gaussians", "cpu_seconds")
+    found = []
+    for (version, recipe, scene, split), mine in groups.items():
+        values = {name: [getattr(row, name) for row in mine] for name in names}
+        means = {name: None if None in them else fmean(them) for name, them in values.items()}
+        means["worst"] = min(row.worst for row in mine)
+        psnr, miou = values["psnr"], values["miou"]
+        spread = None if None in miou else max(miou) - min(miou)
+        found.append(
+            Summary(scene, split, recipe, version, len(mine), means, max(psnr) - min(psnr), spread)
+        )
+    return found
+
+
+def _print(rows: Sequence[UnseenRow]) -> None:
+    def number(value: float | None, digits: int) -> str:
+        return "--" if value is None else f"{value:.{digits}f}"
+
+    lines = []
+    for s in summary(rows):
+        m = s.means
+        assert m["lonely"] is not None
+        lines.append(
+            (
+                s.scene, s.split, f"{s.recipe}, {s.results_version}", f"{s.seeds}", number(m["psnr"], 2),
+                number(s.psnr_spread, 2), number(m["worst"], 2), number(m["ssim"], 3), number(m["miou"], 3),
+                number(s.miou_spread, 3), number(m["miou_lerf_ovs"], 3), number(100 * m["lonely"], 1),
+                number(m["gaussians"], 0), number(m["cpu_seconds"], 0),
+            )
+        )  # fmt: skip
+    columns = (
+        "scene",
+        "trained on",
+        "recipe, results version",
+        "seeds",
+        "PSNR",
+        "spread",
+        "worst",
+        "SSIM",
+        "mIoU",
+    )
+    more = ("spread", "LERF-OVS", "lonely, %", "Gaussians", "CPU s")
+    show("unseen views: means over seeds", (*columns, *more), lines)

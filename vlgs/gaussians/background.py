@@ -1,0 +1,115 @@
+"""Far Gaussians behind everything, so that no ray ends in nothing.
+
+Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training explains such pixels
+by what it has: large, faint ones close to the cameras, which fit every training view and fog all others. And where no training view
+looked, an unseen view would look through the scene into black.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from vlgs.gaussians.config import GaussiansConfig
+from vlgs.gaussians.init import Cloud, parameters_of
+from vlgs.gaussians.neighbors import mean_squared_distance
+from vlgs.geometry import camera_center, scene_extent
+from vlgs.types import Camera, Scene
+
+CELLS = (4, 16)
+"""A view is looked through in squares, so many across its longer side: half the square root of the points in it, within these."""
+CAMERA_SHARE, POINT_SHARE = 10.0, 2.0
+"""Radius of the sphere: the larger of so many scene extents and so many times the distance within which 19 of 20 points lie."""
+MAX_VIEWS = 64
+"""Views that are looked through, evenly chosen."""
+MAX_POINTS = 1 << 17
+"""Points that are looked for in a view, evenly chosen."""
+
+
+def with_background(
+    parameters: dict[str, Tensor], scene: Scene, config: GaussiansConfig
+) -> dict[str, Tensor]:
+    """The first Gaussians and, behind them, round ones on a sphere around cameras and scene.
+
+    A scene without sparse points gets none: its random ones are everywhere already.
+
+    Args:
+        parameters: From `initialise`.
+        scene: Its training views and sparse points.
+        config: `background` directions all around.
+    """
+    sphere = background(scene, config.background)
+    if len(sphere.points) == 0:
+        return parameters
+    scales = mean_squared_distance(sphere.points).sqrt()
+    behind = parameters_of(sphere, scales, config, parameters["features"].shape[1])
+    return {name: torch.cat([value, behind[name]]) for name, value in parameters.items()}
+
+
+def background(scene: Scene, count: int) -> Cloud:
+    """Evenly spread points of the sphere and the colours that training views have there.
+
+    A direction has the mean colour of the views that look past every sparse point there, if most that look into it do. Other
+    directions have the colour of the nearest such one: what hides the sky in them is not the colour of the sky. Where there is none at
+    all, in a room with points on every wall, the mean of all views that look into a direction has to do.
+    """
+    points = scene.points.float()
+    points = points[points.isfinite().all(dim=1)]
+    points = points[:: -(-len(points) // MAX_POINTS) or 1]
+    if count == 0 or len(points) == 0:
+        return Cloud(points[:0], points[:0])
+    viewmats = torch.stack([view.camera.viewmat for view in scene.train]).float()
+    middle = camera_center(viewmats).mean(dim=0)
+    within = (points - middle).norm(dim=1).quantile(0.95).item()
+    radius = max(CAMERA_SHARE * scene_extent(viewmats), POINT_SHARE * within)
+    sphere = middle + radius * _directions(count)
+    seen, past = torch.zeros(count), torch.zeros(count)
+    total, sky = torch.zeros(count, 3), torch.zeros(count, 3)
+    for view in scene.train[:: -(-len(scene.train) // MAX_VIEWS)]:
+        x, y, inside = _project(sphere, view.camera)
+        pixels = view.read_image()[y[inside].long(), x[inside].long()].float() / 255.0
+        free = _beside_points(points, view.camera, x[inside], y[inside])
+        seen += inside
+        total[inside] += pixels
+        past[inside] += free
+        sky[inside] += pixels * free[:, None]
+    known = 2 * past > seen
+    if not known.any():
+        known, past, sky = seen > 0, seen, total
+    nearest = torch.cdist(sphere, sphere[known]).argmin(dim=1)
+    return Cloud(sphere, (sky[known] / past[known][:, None])[nearest])
+
+
+def _directions(count: int) -> Float[Tensor, "count 3"]:
+    """A sunflower around a sphere: even, and without a random draw."""
+    turn = torch.arange(count) + 0.5
+    z, angle = 1 - 2 * turn / count, math.pi * (1 + math.sqrt(5)) * turn
+    flat = (1 - z.square()).sqrt()
+    return torch.stack([flat * angle.cos(), flat * angle.sin(), z], dim=1)
+
+
+def _project(
+    points: Float[Tensor, "n 3"], camera: Camera
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
+    """Pixel coordinates, and whether a point is in front of the camera and within its image."""
+    viewmat, K = camera.viewmat.float(), camera.K.float()
+    x, y, depth = ((points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T).unbind(-1)
+    x, y = x / depth, y / depth
+    inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return x, y, inside
+
+
+def _beside_points(
+    points: Float[Tensor, "n 3"], camera: Camera, x: Float[Tensor, " m"], y: Float[Tensor, " m"]
+) -> Bool[Tensor, " m"]:
+    """Whether no sparse point lies in the square of a pixel, or in one beside it."""
+    at_x, at_y, inside = _project(points, camera)
+    cells = min(max(math.sqrt(int(inside.sum())) / 2, CELLS[0]), CELLS[1])
+    size = max(camera.width, camera.height) / cells
+    rows, columns = math.ceil(camera.height / size), math.ceil(camera.width / size)
+    taken = torch.zeros(1, rows, columns)
+    taken[0, (at_y[inside] / size).long(), (at_x[inside] / size).long()] = 1
+    taken = max_pool2d(taken, 3, stride=1, padding=1)[0] > 0
+    return ~taken[(y / size).long(), (x / size).long()]
