@@ -34,9 +34,16 @@ def view_weights(model: SplatModel, camera: Camera) -> Float[Tensor, " n"]:
     with torch.enable_grad():
         ones = torch.ones(model.count, 1, requires_grad=True)
         group = ChannelGroup(ones, gaussians.opacities.detach())
-        geometry = (gaussians.means, gaussians.quats, gaussians.scales)
-        fixed = (value.detach() for value in geometry)
-        pose = (camera.viewmat, camera.K, camera.width, camera.height)
-        image = rasterize(*fixed, [group], *pose, config=model.raster).images[0]
+        image = rasterize(
+            gaussians.means.detach(),
+            gaussians.quats.detach(),
+            gaussians.scales.detach(),
+            [group],
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            config=model.raster,
+        ).images[0]
         (weights,) = torch.autograd.grad(image.sum(), ones)
     return weights[:, 0]

@@ -1,12 +1,15 @@
 """From finished runs to the files of the tables."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from vlgs.config import RESULTS_VERSION
 from vlgs.files import write_changed
 from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import (
+    Line,
     add_kept,
     by_row,
     read_metrics,
@@ -53,9 +56,15 @@ def write_all(
         raise ValueError(
             f"tables: {results} must hold finished runs (runs/*/metrics.json) or runs.csv, got neither"
         )
-    frame, rows = tidy(lines), by_row(lines)
+    frame = tidy(lines)
     require_one_meaning(frame)
     write_frame(frame, results)
+    current = [line for line in lines if line.results_version == RESULTS_VERSION]
+    if len(current) < len(lines):
+        _say_older(lines)
+        if not current:
+            return []  # and leave what was written of them as it is
+    rows = by_row(current)
     refused: dict[str, UnknownOptionError] = {}
     fitting: set[str] = set()
     for file in files:
@@ -80,6 +89,16 @@ def write_all(
     for label in refused.keys() - fitting:
         raise refused[label]
     return [file.parent for file in files]
+
+
+def _say_older(lines: Sequence[Line]) -> None:
+    versions = {line.config_hash: line.results_version for line in lines}
+    older = [version for version in versions.values() if version != RESULTS_VERSION]
+    print(
+        f"{len(older)} runs are of results version {', '.join(map(str, sorted(set(older))))}, which no table mixes with version "
+        f"{RESULTS_VERSION}: they stay in runs.csv, and tables that were written of them stay as they are",
+        file=sys.stderr,
+    )
 
 
 def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
