@@ -26,8 +26,6 @@ from vlgs.text import screen
 
 log = logging.getLogger(__name__)
 
-_IN_FULL = "HYDRA_FULL_ERROR" in os.environ
-
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> None:
@@ -55,27 +53,30 @@ def command() -> None:
 
 @contextmanager
 def _whole_errors() -> Iterator[None]:
-    """Have Hydra raise an error at the end of a multirun, which it would end with half of a traceback."""
+    """Have Hydra raise the error of a multirun, which it would end with half of a traceback."""
+    before = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         yield
     finally:
-        if not _IN_FULL:
-            del os.environ["HYDRA_FULL_ERROR"]
+        del os.environ["HYDRA_FULL_ERROR"]
+        if before is not None:
+            os.environ["HYDRA_FULL_ERROR"] = before
 
 
 @contextmanager
 def _errors_in_a_line() -> Iterator[None]:
     """End the process with what is wrong, unless HYDRA_FULL_ERROR asks for the traceback."""
+    in_full = "HYDRA_FULL_ERROR" in os.environ
     try:
         yield
     except (ValueError, OSError, FloatingPointError) as error:
-        if _IN_FULL:
+        if in_full:
             raise
         print(screen(f"error: {error}"), file=sys.stderr)
         sys.exit(BUSY if isinstance(error, BlockingIOError) else 1)
     except KeyboardInterrupt:  # while training it is a graceful stop, and never comes here
-        if _IN_FULL:
+        if in_full:
             raise
         print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(STOPPED)
@@ -103,8 +104,10 @@ def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
     """Leave nothing of a run that is refused before its first iteration."""
     try:
         yield
-    except (ValueError, OSError):
+    except (ValueError, OSError, FloatingPointError):
         begun = {".lock", folder.config.name}
+        if folder.curves.is_file() and folder.curves.read_bytes().count(b"\n") <= 1:
+            begun.add(folder.curves.name)  # the heads of its columns alone
         if folder.path.is_dir() and all(path.name in begun for path in folder.path.iterdir()):
             for path in folder.path.iterdir():
                 path.unlink()

@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vlgs.ablate import job
-from vlgs.config import CONF, identity, override_value, run_id
+from vlgs.config import CONF, RESULTS_VERSION, identity, override_value, run_id
 from vlgs.runs import BUSY, STOPPED, RunFolder
 
 TABLE = """
@@ -61,7 +61,7 @@ def fake_metrics(overrides: list[str], miou: float = 0.5) -> dict[str, Any]:
         "dataset": "synthetic",
         "scene": config.data.scene,
         "protocol": "dense@1/synthetic",
-        "results_version": 2,
+        "results_version": RESULTS_VERSION,
         "commit": "abc",
         "machine": {"cpu": "a cpu"},
     }

@@ -10,6 +10,7 @@ from pathlib import Path
 import yaml
 
 from tests.fuzz.judge import Attack
+from vlgs.config import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import load_table
@@ -29,7 +30,7 @@ rows:
 METRICS = {
     "miou": 0.5, "psnr": 30.0, "n_gaussians": 20, "train_seconds": 60.0, "per_category": {"cup": 0.5, "pot": None},
     "category_kinds": {"cup": "other"}, "indicator": {"edges": [-1.0, 0.0, 1.0], "other": [0.25, 0.75]}, "scene": "glassware",
-    "dataset": "synthetic", "protocol": "dense@1/synthetic", "results_version": 2, "commit": "abcdef",
+    "dataset": "synthetic", "protocol": "dense@1/synthetic", "results_version": RESULTS_VERSION, "commit": "abcdef",
     "machine": {"cpu": "a cpu", "cores": 2}, "reasons": {"lpips": "no weights"}, "levels": [3], "level_models": "single",
     "skips": {"a": {"skipped": 9, "share": 0.5, "seconds_saved": None}}, "failure": None,
 }  # fmt: skip

@@ -1,5 +1,7 @@
 """Far Gaussians where views look past the sparse points, and nowhere else."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -84,3 +86,10 @@ def test_the_first_gaussians_stay_and_the_background_comes_after_them():
         assert torch.equal(value[: len(first[name])], first[name])
     angle = both["log_scales"][1:, 0].exp() / both["means"][1:].norm(dim=1)
     assert 0.1 < angle.mean() < 0.5  # neighbours touch: 200 directions are 0.25 radians apart
+
+
+def test_cameras_that_see_nothing_of_the_sphere_get_none():
+    whole = scene(shell(-1.1))
+    far_out = torch.tensor([[50.0, 0.0, -1e6], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
+    views = tuple(replace(v, camera=replace(v.camera, K=far_out)) for v in whole.train)
+    assert len(background(replace(whole, train=views), 500).points) == 0

@@ -60,7 +60,10 @@ NO_GRADIENT = {
     "vlgs.fusion.none.NoFusion.forward": "returns its arguments",
     "vlgs.indicator.Fixed.__call__": "a constant",
     "vlgs.gaussians.densify.DensifyState.mean": "a statistic",
+    "vlgs.gaussians.background.with_background": "placed once",
     "vlgs.gaussians.init.initialise": "placed once",
+    "vlgs.gaussians.init.parameters_of": "placed once",
+    "vlgs.gaussians.init.distance_to_nearest": "of what is placed or pruned",
     "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
     "vlgs.gaussians.ply.read_ply": "from a file",
     "vlgs.gaussians.ply.parse_ply": "from a file",
@@ -242,6 +245,9 @@ CHECKS: dict[str, Callable[[], Check]] = {
         lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
     ),
     "vlgs.losses.Losses.language_loss": lambda: both(Losses(lang_loss="cos").language_loss, VALID),
+    "vlgs.losses.Losses.absent_loss": lambda: (
+        lambda feature: Losses().absent_loss(feature, ~VALID), [draw(*VALID.shape, 3)]
+    ),
     "vlgs.losses.Losses.blended_loss": lambda: both(Losses().blended_loss, VALID, 0.7),
     "vlgs.geometry.quat_to_rotmat": lambda: (quat_to_rotmat, [draw(4, 4)]),
     "vlgs.geometry.rotmat_to_quat": lambda: (rotmat_to_quat, [rotation]),

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from vlgs.config import RESULTS_VERSION
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import Row, Table
 
@@ -58,7 +59,7 @@ def fake_runs(
                         "dataset": "synthetic",
                         "scene": scene,
                         "protocol": "dense@1/synthetic",
-                        "results_version": 2,
+                        "results_version": RESULTS_VERSION,
                         "commit": "abcdef",
                         "machine": {"cpu": "a cpu", "cores": 2},
                         "per_view": {"a": {"psnr": 30.0}},

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from tables_fakes import fake_runs
 
+from vlgs.config import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.fill import Cell, Filled, Place, fill
@@ -331,7 +332,13 @@ def test_all_formats_say_where_the_numbers_come_from(table: Table, tmp_path: Pat
     folder = tmp_path / "synthetic"
     for name in ("tiny.csv", "tiny.md", "tiny.tex"):
         text = (folder / name).read_text()
-        for words in ("dense@1/synthetic", "abcdef", "a cpu", "seeds 0, 1", "results version 2"):
+        for words in (
+            "dense@1/synthetic",
+            "abcdef",
+            "a cpu",
+            "seeds 0, 1",
+            f"results version {RESULTS_VERSION}",
+        ):
             assert words in text, (name, words)
     cells = pd.read_csv(folder / "tiny.csv", comment="#")
     assert len(cells) == 4 * 3 * 2

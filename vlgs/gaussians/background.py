@@ -75,6 +75,8 @@ def background(scene: Scene, count: int) -> Cloud:
         total[inside] += pixels
         past[inside] += free
         sky[inside] += pixels * free[:, None]
+    if not seen.any():  # cameras that see nothing of the sphere: of a huge focal length, or a principal point far out
+        return Cloud(points[:0], points[:0])
     known = 2 * past > seen
     if not known.any():
         known, past, sky = seen > 0, seen, total
