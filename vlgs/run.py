@@ -45,10 +45,9 @@ def command() -> None:
     with _errors_in_a_line():
         take_command_line()
         check_command(sys.argv[1:])
-        os.environ["HYDRA_FULL_ERROR"] = (
-            "1"  # or Hydra would end a multirun with half of a traceback
-        )
-        main()
+        several = {"-m", "--multirun"} & set(sys.argv)
+        with _whole_errors() if several else nullcontext():
+            main()
 
 
 @contextmanager
