@@ -173,7 +173,7 @@ class Losses:
     rgb_loss: Literal["mse", "l1_dssim"] = "mse"
     lang_loss: Literal["mse", "l1", "cos"] = "mse"
     lang_pixels: Pixels = "valid"
-    absent_weight: float = 0.5
+    absent_weight: float = 0.0
     """What a pixel without a mask counts for, which is drawn to the zero code, "nothing": little, so that a thing whose mask was missed in
     some views keeps the code that the others give it, and a sky that none claims answers no word."""
     blend_weight: float = 1.2

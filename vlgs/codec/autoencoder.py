@@ -49,7 +49,7 @@ class AutoencoderTraining:
     things apart, because a rendered code is never quite the one that was learnt."""
     min_coverage: float = 0.5
     """Codes are shortened by a factor drawn from this to 1, as rendering does where the weights do not add up to 1."""
-    empty: float = 0.01
+    empty: float = 0.0
     """Weight of what codes near zero decode to, in the loss: to the opposite of the mean embedding, which is farther from every word than
     anything seen is. It is what a pixel answers that no language covers. 0 leaves it to chance, as LangSplat does."""
     seed: int = 0
