@@ -206,7 +206,7 @@ def _who(config: Any, key: str, target: str) -> str:
     return last(key) or last(str(config._get_full_key(None) or "")) or target.rpartition(".")[2]
 
 
-RESULTS_VERSION = 3
+RESULTS_VERSION = 4
 """Part of every run id; raised by a change that can move a number."""
 
 PLACES = frozenset(

@@ -24,8 +24,6 @@ SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 L1_SHARE = 0.8
-ABSENT_LENGTH = 0.5
-"""Length of a code, 1 where a mask gave it, from which the absence of a mask is taken for a mask that was missed."""
 RENDER_FLOOR = 1e-2
 """Shorter renders are treated as this long in `masked_cosine`: codes start at zero, where a cosine has no slope."""
 TARGET_FLOOR = 1e-6
@@ -173,9 +171,6 @@ class Losses:
     rgb_loss: Literal["mse", "l1_dssim"] = "mse"
     lang_loss: Literal["mse", "l1", "cos"] = "mse"
     lang_pixels: Pixels = "valid"
-    absent_weight: float = 0.0
-    """What a pixel without a mask counts for, which is drawn to the zero code, "nothing"; 0, the default: it teaches nothing. At 0.5 a sky
-    that no mask claims answers fewer words, and a room, where a pixel lacks a mask because it was missed, is segmented worse."""
     blend_weight: float = 1.2
     """lambda of Eq. overall."""
 
@@ -183,11 +178,10 @@ class Losses:
         _require_choice("rgb_loss", self.rgb_loss, ("mse", "l1_dssim"))
         _require_choice("lang_loss", self.lang_loss, tuple(_LANGUAGE))
         _require_choice("lang_pixels", self.lang_pixels, ("valid", "all"))
-        for name in ("blend_weight", "absent_weight"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise ValueError(
-                    f"Losses: {name} must be finite and >= 0, got {getattr(self, name)}"
-                )
+        if not 0 <= self.blend_weight < float("inf"):
+            raise ValueError(
+                f"Losses: blend_weight must be finite and >= 0, got {self.blend_weight}"
+            )
 
     def color_loss(
         self,
@@ -206,17 +200,6 @@ class Losses:
     ) -> Float[Tensor, ""]:
         """Second term of Eq. raster; `valid` are the pixels that have a language code."""
         return _LANGUAGE[self.lang_loss](feature, target, valid, self.lang_pixels)
-
-    def absent_loss(
-        self, feature: Float[Tensor, "h w d"], absent: Bool[Tensor, "h w"]
-    ) -> Float[Tensor, ""]:
-        """Squared length of the codes where no mask lies, per number of the whole image: few such pixels count little.
-
-        A long code comes from masks of other views, which know better: the error stops growing from `ABSENT_LENGTH` on.
-        """
-        square, limit = feature.square().sum(dim=-1), ABSENT_LENGTH**2
-        error = (square * limit / (square + limit)).masked_fill(~absent, 0)
-        return self.absent_weight * error.sum() / max(feature.numel(), 1)
 
     def blended_loss(
         self,

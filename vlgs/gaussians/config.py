@@ -76,7 +76,10 @@ class GaussiansConfig:
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
-    """Directions all around in which a far Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
+    """Directions all around in which a Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
+    silent_above: float = 0.7
+    """Share of a Gaussian's language weight outside of masks, over the training views, above which its code is zero in the end
+    (`vlgs.module.silence`); 1: none is."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -103,6 +106,7 @@ class GaussiansConfig:
         require_range("gaussians", 1, 10**7, init_points=self.init_points)
         require_range("gaussians", 1, 10**9, max_count=self.max_count)
         require_range("gaussians", 0, 10**6, background=self.background)
+        require_range("gaussians", 0, 1, silent_above=self.silent_above)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),

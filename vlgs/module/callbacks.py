@@ -17,6 +17,7 @@ from vlgs.gaussians import densify, reset_opacity
 from vlgs.module.checkpoint import save_checkpoint
 from vlgs.module.curves import COLUMNS, csv_lines, read_rows
 from vlgs.module.lightning import VLGSModule
+from vlgs.module.silence import silence
 from vlgs.module.state import capture
 from vlgs.runs import RunFolder, stop_signals
 
@@ -56,6 +57,25 @@ class Densification(L.Callback):
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)
+
+
+class Silence(L.Callback):
+    """After the last iteration, take the codes of what lies outside of masks (`vlgs.module.silence`)."""
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Do so when it is time."""
+        module = _own(pl_module)
+        share, features = module.gaussians_config.silent_above, module.model.splats["features"]
+        done = module.next_step == module.settings.iterations
+        if done and share < 1 and module.has_language and features.requires_grad:
+            silence(module, share)
 
 
 class OwnFolder(L.Callback):

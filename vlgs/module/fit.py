@@ -17,6 +17,7 @@ from vlgs.module.callbacks import (
     GracefulStop,
     OwnFolder,
     ProgressLine,
+    Silence,
     TrainingClock,
 )
 from vlgs.module.checkpoint import keep_from, load_checkpoint
@@ -78,6 +79,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
         OwnFolder(folder),  # before whatever writes
         StuckAlarm(module.settings.log_every),
         Densification(),
+        Silence(),
         TrainingClock(),  # ends an iteration after its densification
         CurveLog(folder.curves, module.settings.log_every),
         Checkpoints(folder.checkpoint, module.settings.checkpoint_every, options.meta),

@@ -257,19 +257,13 @@ class VLGSModule(L.LightningModule):
     def _color_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.color is None:
             return torch.zeros(())
-        return self.losses.color_loss(render.color, target.image, _covered(target.view))
+        return self.losses.color_loss(render.color, target.image, covered(target.view))
 
     def _language_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.feature is None or target.codes is None:
             return torch.zeros(())
         feature = render.feature.view_as(target.codes)
-        loss = self.losses.language_loss(feature, target.codes, target.valid)
-        if target.valid is None or self.losses.absent_weight == 0:
-            return loss
-        covered, absent = _covered(target.view), ~target.valid
-        if covered is not None:
-            absent &= covered.repeat_interleave(self.scene.mask_levels, dim=1)
-        return loss + self.losses.absent_loss(feature, absent)
+        return self.losses.language_loss(feature, target.codes, target.valid)
 
     def _backward(
         self, total: Tensor, color_losses: list[Tensor], renders: list[ViewRender]
@@ -370,5 +364,6 @@ class VLGSModule(L.LightningModule):
                 )
 
 
-def _covered(view: View) -> Bool[Tensor, "h w"] | None:
+def covered(view: View) -> Bool[Tensor, "h w"] | None:
+    """Pixels that the photograph of a view covers; None for all."""
     return None if view.read_valid is None else view.read_valid()
