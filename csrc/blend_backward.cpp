@@ -1,5 +1,5 @@
 // The same walk back to front, one Gaussian of a tile at a time over the blocks it reaches, so that what
-// belongs to the Gaussian is summed in registers and leaves them once per tile. README.md derives the
+// belongs to the Gaussian is summed in registers and leaves them once per tile. csrc/README.md derives the
 // recurrences.
 #include "alpha.h"
 

@@ -1,5 +1,5 @@
 // Gaussians and a camera to ellipses on the image plane, and back (Zwicker et al. 2001). All in double,
-// whatever is stored: this is O(n) work, and a needle's short axis survives nothing less. README.md derives
+// whatever is stored: this is O(n) work, and a needle's short axis survives nothing less. csrc/README.md derives
 // both directions.
 #include "isa.h"
 #include "simd.h"

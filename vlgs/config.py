@@ -35,7 +35,7 @@ NOT_PART_OF_A_RUN = frozenset(
 not depend on the folder that its data lies in."""
 
 LEVELS = (1, 2, 3)
-"""Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (systems.md D.8)."""
+"""Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (conf/README.md, D.8)."""
 
 OmegaConf.register_new_resolver(
     "code_channels",
@@ -150,7 +150,7 @@ def instantiate(config: Any, **arguments: Any) -> Any:
     """Construct what a `_target_` names; its arguments have the types that it asks for, and a plugin's part is really a plugin's.
 
     Raises:
-        ValueError: If a name is neither ours nor that of something in a plugin (`vlgs.data.os.system`), an argument is missing or has
+        ValueError: If a name is neither ours nor that of something in a plugin (as in ``vlgs.data.<module>.os.system``), an argument is missing or has
             another type, or the constructor says so itself, without Hydra's wrapping.
         OSError: Likewise.
     """

@@ -133,7 +133,7 @@ class Gaussians:
     opacities: Float[Tensor, " n"]
     """Colour opacity o in [0, 1]."""
     indicators: Float[Tensor, " n *levels"]
-    """Semantic indicator l in [0, 1] (Eq. lancity); one per mask level with ``indicator=per_level``."""
+    """Semantic indicator l in [0, 1] (Eq. 6); one per mask level with ``indicator=per_level``."""
     sh0: Float[Tensor, "n 3"]
     """Degree-0 spherical harmonics coefficient; RGB = 0.5 + 0.28209479 * sh0."""
     shN: Float[Tensor, "n s 3"]  # noqa: N815 (gsplat's name)
@@ -141,12 +141,12 @@ class Gaussians:
     features: Float[Tensor, "n d"]
     """Language code f; those of all mask levels side by side with ``levels=joint``."""
     language_shape: Shape | None = None
-    """Covariance that language is blended with; None where it is colour's (``sharing=pos``, tab:ab-seperate)."""
+    """Covariance that language is blended with; None where it is colour's (``sharing=pos``, Table 17)."""
 
 
 @dataclass(frozen=True)
 class ChannelGroup:
-    """Channels that are blended with one weight per Gaussian and one transmittance per pixel (Eqs. rgb-render, lancity)."""
+    """Channels that are blended with one weight per Gaussian and one transmittance per pixel (Eqs. 1 and 6)."""
 
     values: Float[Tensor, "n c"]
     """What is blended: colour, language code, ids, CLIP vectors; any c >= 1."""

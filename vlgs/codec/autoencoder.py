@@ -1,4 +1,4 @@
-"""LangSplat's autoencoder of one scene's embeddings, trained in seconds (systems.md A.2, stage 1; C.5)."""
+"""LangSplat's autoencoder of one scene's embeddings, trained in seconds (Qin et al., CVPR 2024)."""
 
 import hashlib
 import json
@@ -75,7 +75,7 @@ DEFAULT_TRAINING = AutoencoderTraining()
 
 
 class Autoencoder(nn.Module):
-    """A few numbers per Gaussian in place of an embedding of hundreds (systems.md A.2, stage 1).
+    """A few numbers per Gaussian in place of an embedding of hundreds.
 
     Encoder and decoder have LangSplat's layers, names and unit outputs. The loss is one minus the cosine of each
     embedding and its reconstruction. LangSplat's MSE + 0.001 (1 - cos) is a multiple of it between unit vectors, which

@@ -142,7 +142,7 @@ class _Parts:
 
 
 def load_scene(root: str, **options: Any) -> Scene:
-    """Read a COLMAP scene (S. C.1, C.2, C.4); the `_target_` of ``conf/data/colmap.yaml``.
+    """Read a COLMAP scene; the `_target_` of ``conf/data/colmap.yaml``.
 
     Pixels stay on disk until a view's readers are called. Views are in order of image name.
 

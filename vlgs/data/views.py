@@ -171,8 +171,8 @@ class _Masks(Mapping[str, Bool[Tensor, "h w"]]):
 def map_sizes(lens: Lens, camera_size: tuple[int, int]) -> list[tuple[int, int]]:
     """Sizes that a mask or label map of a view may have, in the geometry of its image file (not undistorted).
 
-    It was made from the image file, or from the full-size original of a scaled copy, or from either after LangSplat's rule
-    that no image is higher than 1080 pixels (S. A.2). Another size would have to be guessed at.
+    It was made from the image file, or from the full-size original of a scaled copy, or from either after the rule of
+    LangSplat's preprocessing that no image is higher than 1080 pixels. Another size would have to be guessed at.
     """
     sizes = [lens.file_size, camera_size]
     for width, height in (lens.file_size, camera_size):

@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, prune and reset (3DGS; systems.md A.1, D.10, D.11)."""
+"""Adaptive density control: clone, split, prune and reset (Kerbl et al. 2023; conf/README.md, D.10 and D.11)."""
 
 import logging
 import math
@@ -47,7 +47,7 @@ class DensifyState:
         width: int,
         height: int,
     ) -> None:
-        """Add one real view; gradients of several views are never summed before their length is taken (D.11).
+        """Add one real view; gradients of several views are never summed before their length is taken (conf/README.md, D.11).
 
         Args:
             mean2d_grad: Gradient of the loss with respect to `Rendered.mean2d`, per pixel.
@@ -150,7 +150,7 @@ def reset_opacity(
 ) -> None:
     """Lower every opacity to `reset_to` at most and forget its Adam moments, in place.
 
-    Indicators stay as they are unless `reset_indicator` (systems.md D.10).
+    Indicators stay as they are unless `reset_indicator` (conf/README.md, D.10).
     """
     names = ["opacity_logits"]
     if config.densify.reset_indicator:

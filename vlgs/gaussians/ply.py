@@ -1,4 +1,4 @@
-"""Gaussians as a 3DGS ``point_cloud.ply`` (systems.md C.6), with language codes and indicators appended.
+"""Gaussians as a ``point_cloud.ply`` of 3DGS, with language codes and indicators appended.
 
 Three dialects differ in what follows the rotation: ours ``lang_0`` ... and ``indicator``, Feature-3DGS ``semantic_0`` ...,
 3DGS nothing. Whatever is there is read.

@@ -22,7 +22,7 @@ from vlgs.runs import RunFolder, stop_signals
 
 
 class Densification(L.Callback):
-    """Clone, split, prune and reset, from the two real views of each iteration (systems.md A.1, D.10, D.11)."""
+    """Clone, split, prune and reset, from the two real views of each iteration (conf/README.md, D.10 and D.11)."""
 
     def on_train_batch_end(
         self,

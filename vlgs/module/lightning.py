@@ -1,4 +1,4 @@
-"""Training as one LightningModule: parameters, the step of Eq. overall, one Adam."""
+"""Training as one LightningModule: parameters, the step of Eq. 12, one Adam."""
 
 import math
 import time
@@ -53,11 +53,11 @@ class StepReport:
     loss: float = math.nan
     color_mse: float = math.nan
     blend_weight: float = 0.0
-    """lambda * SSIM(I1, I2) of Eq. blend; 0 where the blended view was not rendered."""
+    """lambda * SSIM(I1, I2) of Eq. 11; 0 where the blended view was not rendered."""
 
 
 class VLGSModule(L.LightningModule):
-    """Two real views and one language-only blended view per iteration (Eqs. raster, blend, overall).
+    """Two real views and one language-only blended view per iteration (Eqs. 8, 11 and 12).
 
     Everything random is a function of (seed, step); `next_step` is the only counter, so a module that was saved after
     a step and restored goes on bit for bit as if it had never stopped.
@@ -66,7 +66,7 @@ class VLGSModule(L.LightningModule):
         model: What is trained.
         scene: Training views and language supervision.
         blend: The blended camera view.
-        losses: Losses of Eqs. raster, blend, overall.
+        losses: Losses of Eqs. 8, 11 and 12.
         gaussians_config: Densification.
         trainer_config: Budget, schedule and learning rates.
         seed: Seed of all draws.
@@ -312,7 +312,7 @@ class VLGSModule(L.LightningModule):
         renders: list[ViewRender],
         fused: FusedGaussians,
     ) -> Float[Tensor, ""]:
-        """Third term of Eq. overall."""
+        """Third term of Eq. 12."""
         (first, second), feature = targets, None
         assert first.codes is not None
         assert first.valid is not None
@@ -350,7 +350,7 @@ class VLGSModule(L.LightningModule):
             yield from self.model.fusion.named_parameters("fusion")
 
     def _refuse_non_finite(self, where: str) -> None:
-        """Stop before Adam spreads one bad number over everything (pitfalls N1)."""
+        """Stop before Adam spreads one bad number over everything (tests/README.md, N1)."""
         looked_at: dict[str, Tensor] = {}
         for name, parameter in self._trained():
             if parameter.grad is not None:

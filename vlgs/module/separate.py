@@ -1,4 +1,4 @@
-"""Colour and language as two sets of Gaussians that share nothing (``sharing=none``; systems.md D.16)."""
+"""Colour and language as two sets of Gaussians that share nothing (``sharing=none``; conf/README.md, D.16)."""
 
 from dataclasses import replace
 

@@ -34,7 +34,7 @@ class SkipCount:
     work: dict[str, Work] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     similarities: dict[tuple[int, int], float] = field(default_factory=dict)
-    """SSIM(I1, I2) per pair of views: constant, so computed once (systems.md D.12)."""
+    """SSIM(I1, I2) per pair of views: constant, so computed once (conf/README.md, D.12)."""
 
     @contextmanager
     def doing(self, work: str, count: int = 1) -> Iterator[None]:

@@ -144,7 +144,7 @@ def train_all(
         stages: Where and with what.
         scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate`` and ``joint``.
         sharing: Whether colour and language are one model, and whether language is trained at all.
-        augment: Further training views, rendered from a first model of colour alone (systems.md D.17); what `Offline.require`
+        augment: Further training views, rendered from a first model of colour alone (conf/README.md, D.17); what `Offline.require`
             asks for is there.
         joint: Whether one model learns all levels.
 

@@ -44,7 +44,7 @@ def decoded_cosines(
 ) -> Float[Tensor, "k h w"]:
     """Cosine of every text vector with every pixel of a rendered map of language codes.
 
-    Codes are decoded before they are compared (systems.md D.24). A view of one million pixels would be 2 GB of 512-d features;
+    Codes are decoded before they are compared (conf/README.md, D.24). A view of one million pixels would be 2 GB of 512-d features;
     here only `chunk` pixels are decoded at a time.
 
     Args:

@@ -67,7 +67,7 @@ class VocabularyText:
 
 
 class ClipText:
-    """A text tower through transformers, from local files only: raw words, no template (systems.md B.0).
+    """A text tower through transformers, from local files only: raw words, no template.
 
     CLIP's, or that of SigLIP and SigLIP 2. Those were trained on lower case, always padded to their full length on the right and
     without a mask, and look at the last position alone, so that words come to them in just this way. Nothing is loaded before the

@@ -45,7 +45,7 @@ WORDS = 6
 def count_difference(
     language: Float[Tensor, " n"], color: Float[Tensor, " n"], bins: int = 80
 ) -> Float[Tensor, " {bins}"]:
-    """Density of l - o over all Gaussians, in equal bins from -1 to 1 (right of fig. lancity-vis).
+    """Density of l - o over all Gaussians, in equal bins from -1 to 1 (right of Fig. 3).
 
     The area under it is 1; without Gaussians it is zero.
     """

@@ -33,7 +33,7 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 DEEPEST = 100
 """Lists and mappings in each other that a file may have."""
 
-_TABLE_KEYS = {"label", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
+_TABLE_KEYS = {"label", "number", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
 _ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
@@ -46,7 +46,7 @@ class Row:
     overrides: tuple[str, ...] | None
     """Hydra overrides that make the run; None where the method is not built."""
     method: str = ""
-    """Name in conf/method of a method that is not built yet."""
+    """Name of a method that is not built yet."""
     group: str = ""
     """Part of the table that the row belongs to."""
     marks: Mapping[str, bool] = field(default_factory=lambda: _EMPTY)
@@ -75,6 +75,8 @@ class Table:
     """Columns are the categories of a scene instead of scenes."""
     kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
     """Category -> ``translucent_reflective`` or ``other``."""
+    number: int | None = None
+    """Number of the table in the paper's PDF, by which comments cite it; None for a table of our own."""
 
     @property
     def runnable(self) -> tuple[Row, ...]:
@@ -129,6 +131,9 @@ def load_table(path: Path) -> Table:
         )
     if not is_label(label):
         raise ValueError(f"{where}: label must be letters, digits, dots and dashes, got {label!r}")
+    printed = content.get("number")
+    if printed is not None and (type(printed) is not int or printed < 1):
+        raise ValueError(f"{where}: number must be a whole number from 1, got {briefly(printed)}")
     metrics = tuple(_require(where, content, "metrics", list, str))
     for metric in metrics:
         if metric not in QUANTITIES:
@@ -157,6 +162,7 @@ def load_table(path: Path) -> Table:
         rows=rows,
         by_category=by_category,
         kinds=kinds,
+        number=printed,
     )
 
 

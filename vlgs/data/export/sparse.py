@@ -1,4 +1,4 @@
-"""COLMAP's binary model (systems.md C.1), written from cameras and coloured points."""
+"""COLMAP's binary model ("Output Format" in its documentation), written from cameras and coloured points."""
 
 import struct
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""COLMAP's ``.bin`` files, with every count held against the size of the file before it is believed (S. C.1).
+"""COLMAP's ``.bin`` files, with every count held against the size of the file before it is believed.
 
 COLMAP's own reader loads a truncated ``cameras.bin`` as garbage and follows a garbled count until memory ends, hence this
 one: it reads to the last byte or raises, and takes no more memory than the file is long.

@@ -1,4 +1,4 @@
-"""A COLMAP reconstruction as plain values, and what must hold for it to be used (S. C.1)."""
+"""A COLMAP reconstruction as plain values, and what must hold for it to be used."""
 
 import re
 from collections import Counter
