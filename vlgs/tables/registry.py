@@ -33,7 +33,17 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 DEEPEST = 100
 """Lists and mappings in each other that a file may have."""
 
-_TABLE_KEYS = {"label", "number", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
+_TABLE_KEYS = {
+    "label",
+    "number",
+    "caption",
+    "dataset",
+    "scenes",
+    "metrics",
+    "by",
+    "categories",
+    "rows",
+}
 _ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
