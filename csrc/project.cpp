@@ -1,6 +1,6 @@
 // Gaussians and a camera to ellipses on the image plane, and back (Zwicker et al. 2001). All in double,
-// whatever is stored: this is O(n) work, and a needle's short axis survives nothing less. csrc/README.md derives
-// both directions.
+// whatever is stored: this is O(n) work, and a needle's short axis survives nothing less. Both directions are
+// derived in csrc/README.md.
 #include "isa.h"
 #include "simd.h"
 

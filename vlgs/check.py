@@ -1,4 +1,4 @@
-"""Is this scene usable? `python -m vlgs.check data=colmap data.root=PATH` lists every fault; exit status 1 if one is an error."""
+"""Check a scene: `python -m vlgs.check data=colmap data.root=PATH` lists all its faults; exit status 1 if one is an error."""
 
 import logging
 import os

@@ -1,7 +1,7 @@
-"""The command line of `vlgs.run` and `vlgs.check`, read before Hydra: a mistake is one line that says what was meant. Imports no torch.
+"""Checks the command line of `vlgs.run` and `vlgs.check` before Hydra sees it: a mistake gives one line that suggests what was meant. Imports no torch.
 
-Hydra would answer ``trainr=photos`` with "use +trainr=photos", obey that, and run without it; and it constructs callbacks and loggers
-before a task begins. What it is given is therefore composed once here, and looked at.
+Hydra alone would answer ``trainr=photos`` with the advice to write ``+trainr=photos``, which it then accepts and ignores. It also constructs
+callbacks and loggers before a task begins. Therefore the configuration is composed and checked here first.
 """
 
 import sys

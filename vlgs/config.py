@@ -1,4 +1,4 @@
-"""The configuration: where it lives, what it may construct, and which run it names. Imports no torch."""
+"""The configuration: its folder, what it may construct, and the run id that it determines. Imports no torch."""
 
 import hashlib
 import inspect

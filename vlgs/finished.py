@@ -1,4 +1,4 @@
-"""metrics.json of a finished run, read and checked: whoever reads it can rely on what its entries are. Imports no torch."""
+"""Reads metrics.json of a finished run and checks the type of every entry. Imports no torch."""
 
 import json
 import math

@@ -1,7 +1,7 @@
 """What is minimised: Eqs. 8, 11 and 12, and alternatives to them (conf/README.md, D.8).
 
-Images and maps are ``[h, w, c]``. A mask says which pixels count; what the target holds at the others is never looked at,
-so that it may be anything, NaN included.
+Images and maps are ``[h, w, c]``. A mask says which pixels count. The target's values at all other pixels are never read; they
+may even be NaN.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Names of files for text of strangers: of classes, views and scenes. Imports no torch."""
+"""Safe file names for names from others, such as those of classes, views and scenes. Imports no torch."""
 
 import hashlib
 import re

@@ -1,4 +1,4 @@
-"""Everything that `vlgs.run` does before its first step, and `vlgs.check` too: what one refuses the other refuses, in the same words."""
+"""Everything that a run does before its first step. `vlgs.run` and `vlgs.check` share it, so that both refuse the same things with the same words."""
 
 import logging
 import os

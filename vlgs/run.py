@@ -154,7 +154,7 @@ def _report(
     stages: Any,
     text: Any,
 ) -> dict[str, Any]:
-    """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
+    """Evaluate the trained models and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished."""
     from vlgs.gaussians import write_ply
     from vlgs.module.stages import all_skips
     from vlgs.render.cloud import point_cloud
@@ -211,7 +211,7 @@ def _report(
 
 
 def _places(folder: RunFolder) -> dict[str, Path]:
-    """What the summary points at."""
+    """Files that the summary lists, as far as they exist."""
     places = {"run": folder.path, "pictures": folder.renders / "overview.png", "model": folder.ply}
     return {name: path for name, path in places.items() if path.exists()}
 

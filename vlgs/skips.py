@@ -1,7 +1,7 @@
-"""Everything that the code may leave out, in one table that the benchmark and the documentation both read.
+"""The work that the code may leave out. The benchmark measures this table and the documentation prints it.
 
 A skip is *exact* (the same numbers, to the bit or to float order), *bounded* (off by at most what `Skip.bound` says) or
-*statistical*. One that costs nothing and loses nothing has no switch; it stands here because it explains the speed.
+*statistical*. A skip without a switch always pays and changes nothing; it is listed because it explains the speed.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ class Skip:
     off: Value
     """Value of the key with which it is done."""
     default: Literal["on", "off"]
-    """What a run does that says nothing."""
+    """Whether the work is left out where a run does not set the key."""
     kind: Literal["exact", "bounded", "statistical"]
     bound: str
     """Exact: ``same bits`` or ``<= 1e-6``. Bounded: the formula in words."""
@@ -33,7 +33,7 @@ class Skip:
 
     @property
     def switchable(self) -> bool:
-        """Whether the work can be done all the same, to see what leaving it out saves."""
+        """Whether there is a key that turns the skip off, so that its saving can be measured."""
         return bool(self.setting)
 
     def override(self, on: bool) -> str:

@@ -1,7 +1,7 @@
-"""What a ``_target_`` may name, decided by the name alone, before anything is imported. Imports no torch.
+"""Decides which ``_target_`` may be constructed, by its name alone and before anything is imported. Imports no torch.
 
-Ours are those that stand in `conf`, each at a key of its own name: a fusion where a fusion is expected, never a loader of data.
-Others are in a package that the command line trusts: ``plugins=[my_lab]``.
+Allowed are the targets in `conf`, each at the key where it stands there (a fusion where a fusion is expected), and those of packages that
+the command line trusts: ``plugins=[my_lab]``.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """One run in a process of its own: what every launcher calls, on whichever machine it puts it.
 
-A job and whoever launched it talk through files of one folder, so that a worker on another machine needs nothing but the shared
-folder: the job writes how it goes (`<number>.json`), and ends early when a file named `stop` appears.
+Jobs and the ablation exchange files in one folder, so that a worker on another machine needs only access to that folder. A job
+writes its state to `<number>.json`, and stops early when a file named `stop` appears.
 """
 
 import json

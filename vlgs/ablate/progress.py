@@ -1,4 +1,4 @@
-"""How far an ablation is, while the launcher has the main thread: one line, read from what the jobs write."""
+"""The progress line of an ablation, read from the files that its jobs write. It runs in a thread, as the launcher uses the main one."""
 
 import threading
 from collections.abc import Iterator, Sequence

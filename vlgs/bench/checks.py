@@ -1,4 +1,4 @@
-"""Promises of the rasterizer as figures that were measured, each against its bound."""
+"""What the rasterizer promises, measured: each error beside the bound that it must keep."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

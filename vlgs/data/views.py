@@ -1,4 +1,4 @@
-"""One view's files behind the readers of `vlgs.types.View`: decoded when asked, warped by one lens, kept within a limit."""
+"""The files of one view: read when needed, undistorted, and cached. They stand behind the read functions of `vlgs.types.View`."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The work of `python -m vlgs.features`: which photographs, what is done already, one after the other."""
+"""The work of `python -m vlgs.features`: finds the photographs that have no language maps yet, and makes these one by one."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,8 @@
 """Far Gaussians behind everything, so that no ray ends in nothing.
 
-Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training explains such pixels
-by what it has: large, faint ones close to the cameras, which fit every training view and fog all others. And where no training view
-looked, an unseen view would look through the scene into black.
+Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training fits such pixels with
+large, faint Gaussians close to the cameras. These fit every training view and appear as fog in all others. And an unseen view
+that looks where no training view looked would show black.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What a protocol is: a name, a version, a score for every query, and the rule that makes figures of the scores."""
+"""The interface of a protocol: a name, a version, a score for every query, and how the scores become figures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace

@@ -1,4 +1,4 @@
-"""From a relevancy map to a mask: the steps that LangSplat and its successors share, each with its published numbers."""
+"""From a relevancy map to a mask, in the steps that LangSplat and its successors share, with the published constants of each."""
 
 from dataclasses import dataclass
 from typing import Literal

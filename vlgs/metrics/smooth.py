@@ -1,4 +1,4 @@
-"""Windows that slide over a map: the means and votes of the published evaluation codes, borders included."""
+"""Sliding means and votes over a map, with the windows and the treatment of borders of the published evaluation codes."""
 
 import torch
 from jaxtyping import Bool, Float, Int

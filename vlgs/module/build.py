@@ -1,4 +1,4 @@
-"""From a scene and the chosen parts to a module that is ready to train."""
+"""Builds a module that is ready to train from a scene and the chosen parts."""
 
 import logging
 from collections.abc import Mapping

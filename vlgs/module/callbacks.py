@@ -1,4 +1,4 @@
-"""What happens around an iteration: densification, checkpoints, the progress bar, log.csv, a graceful stop."""
+"""Callbacks of training: densification, checkpoints, the progress bar, log.csv, and stopping on Ctrl-C."""
 
 import math
 import os

@@ -1,8 +1,7 @@
-"""Checkpoints: one safetensors file each, which is whole and verified, or is not taken.
+"""Checkpoints: one safetensors file each. A file that is incomplete or damaged is never used.
 
-A file is written under a temporary name and renamed, and the digest of all that it holds stands in its header, so that one rename
-makes a checkpoint complete. The two newest are kept: where the newer one is damaged, the older one is taken. Nothing is ever
-unpickled.
+A file is written under a temporary name and then renamed; its header has a digest of the content. The two newest files are kept,
+and if the newer one is damaged the older one is used. Nothing is ever unpickled.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""log.csv: its columns, and what can still be read of one that was cut short, edited or damaged."""
+"""The columns of log.csv, and a reader that keeps the intact lines of a damaged file."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Train a module to the end of its budget, or to the first Ctrl-C, from wherever its last checkpoint left it."""
+"""Trains a module from its last checkpoint to the end of its budget, or to the first Ctrl-C."""
 
 import logging
 import warnings

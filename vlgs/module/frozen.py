@@ -1,4 +1,4 @@
-"""Training on geometry that does not move: what is constant about a view is computed once."""
+"""Training with frozen geometry: everything about a view that stays constant is computed once."""
 
 from collections.abc import Hashable
 

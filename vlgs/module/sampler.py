@@ -1,4 +1,4 @@
-"""Which views an iteration sees: a pure function of (seed, step), so that a resumed run is the same run."""
+"""Chooses the views of an iteration as a pure function of (seed, step), so that a resumed run sees the same views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What training left out, how often, and what that saved."""
+"""Counts what training skipped, how often, and the time that this saved."""
 
 import time
 from collections.abc import Iterator, Mapping

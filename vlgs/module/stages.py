@@ -1,7 +1,7 @@
-"""Which models a run trains, one after the other, and what they make together.
+"""The stages of a run: the models that it trains, one after the other.
 
-Most runs train one model in the folder of the run. Others train several, each in a sub-folder with a checkpoint and a curve of its
-own; a stage that is done is read back from its checkpoint, so that the same command goes on wherever it was stopped.
+Most runs train one model, in the folder of the run. Others train several, each in a sub-folder with its own checkpoint and
+log.csv. A finished stage is loaded from its checkpoint, so that the same command continues where it was stopped.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""Cosines between language features and text, for one feature or for a whole view that is never decoded at once."""
+"""Cosines between language features and text, for single features or for a view, which is decoded in chunks."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""A model as plain Gaussians: what another program needs to draw the same pictures, without fusion, indicator or vlgs."""
+"""Converts a model to plain Gaussians, from which another program draws the same pictures without fusion or indicator."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

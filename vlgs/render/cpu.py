@@ -1,4 +1,4 @@
-"""The kernel in `csrc` as two autograd functions: projecting, then blending, with `mean2d` between them."""
+"""The kernel in `csrc` as two autograd functions: projection, which gives `mean2d`, and blending."""
 
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""One held-out view as pictures: what was seen, what was rendered, what was answered."""
+"""Pictures of one held-out view: photograph, renders and answers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""The sheet a person would show: views as rows, what the model makes of them as columns. Matplotlib, without a display."""
+"""overview.png: one row per view, with the photograph, the renders and the answers as columns. Matplotlib, without a display."""
 
 import io
 from collections.abc import Sequence

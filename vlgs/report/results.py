@@ -1,4 +1,4 @@
-"""metrics.json: one flat file per run, and the table that says what each entry means."""
+"""metrics.json, one flat file per run, and a table of the meaning of each entry."""
 
 import json
 import math

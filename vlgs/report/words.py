@@ -1,4 +1,4 @@
-"""Which words of a vocabulary the pictures ask where nobody labelled the scene."""
+"""Chooses the words that the pictures ask in a scene without labels."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""On what the tables of a folder are run, and which run a row means there. Imports no torch."""
+"""The data, scenes and seeds behind the tables of one results folder, and the run that belongs to each row. Imports no torch."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ class UnknownOptionError(ValueError):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """On what the rows of a table are run: `results/<name>/benchmark.yaml`, committed with the tables."""
+    """Data, scenes and seeds that every row of a table is run with: `results/<name>/benchmark.yaml`, committed with the tables."""
 
     name: str
     """Folder of the tables below `results`."""

@@ -1,6 +1,6 @@
-"""From runs to the numbers of one table: mean and deviation over seeds beside the paper's value.
+"""Computes the numbers of one table from runs: mean and deviation over seeds, beside the paper's value.
 
-Plain loops: of frames as small as one table's, pandas would take most of the time that all tables take.
+Plain loops, because pandas is slow on frames as small as those of one table.
 """
 
 import math

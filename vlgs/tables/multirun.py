@@ -1,4 +1,4 @@
-"""What a multirun (`python -m vlgs.run -m ...`) ends with: one table of its runs, on whichever launcher they ran."""
+"""The table that is printed at the end of a multirun (`python -m vlgs.run -m ...`), for every launcher."""
 
 import atexit
 import json

@@ -1,4 +1,4 @@
-"""What a procedural scene is a function of."""
+"""The settings that determine a procedural scene."""
 
 import hashlib
 from dataclasses import astuple, dataclass, field, replace

@@ -1,4 +1,4 @@
-"""A procedural scene as training and evaluation want it."""
+"""A procedural scene as a `vlgs.types.Scene`, ready for training and evaluation."""
 
 import zlib
 from collections.abc import Callable, Mapping

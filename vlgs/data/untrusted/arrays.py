@@ -1,4 +1,4 @@
-"""NumPy's npy and npz: headers are read by their own small grammar, and sizes are held against the bytes that there are."""
+"""NumPy's npy and npz files. A small parser reads the headers, and sizes are compared with the bytes that are there."""
 
 import math
 import re
