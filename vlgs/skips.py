@@ -189,7 +189,7 @@ def turn(names: Iterable[str], on: bool) -> tuple[str, ...]:
 
 
 def markdown_table() -> str:
-    """`SKIPS` as README.md shows them."""
+    """`SKIPS` as conf/README.md shows them."""
     rows = []
     for s in SKIPS:
         switch = f"`{s.setting}`: {_value(s.on)} / {_value(s.off)}" if s.switchable else "always on"
