@@ -25,7 +25,7 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 L1_SHARE = 0.8
 ABSENT_LENGTH = 0.5
-"""Length of a code, 1 where a mask gave it, from which the absence of a mask is taken for a mask that was missed."""
+"""From this length on (codes of masks have length 1), a code without a mask counts as an object whose mask was missed."""
 RENDER_FLOOR = 1e-2
 """Shorter renders are treated as this long in `masked_cosine`: codes start at zero, where a cosine has no slope."""
 TARGET_FLOOR = 1e-6
@@ -164,7 +164,7 @@ def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c
 
 @dataclass(frozen=True)
 class Losses:
-    """Which terms Eq. 12 is made of; the paper's are the defaults.
+    """The terms of Eq. 12; the defaults are the paper's.
 
     Raises:
         ValueError: If a value is not one of those listed or the weight is negative.
@@ -174,8 +174,8 @@ class Losses:
     lang_loss: Literal["mse", "l1", "cos"] = "mse"
     lang_pixels: Pixels = "valid"
     absent_weight: float = 0.0
-    """What a pixel without a mask counts for, which is drawn to the zero code, "nothing"; 0, the default: it teaches nothing. At 0.5 a sky
-    that no mask claims answers fewer words, and a room, where a pixel lacks a mask because it was missed, is segmented worse."""
+    """Weight of pixels without a mask, whose codes are drawn to zero, "nothing"; 0, the default, ignores them. With 0.5 a sky without
+    masks answers fewer words, but a room, where masks are missing by mistake, is segmented worse."""
     blend_weight: float = 1.2
     """lambda of Eq. 12."""
 

@@ -14,7 +14,7 @@ _NOT_PLUGINS = frozenset(sys.stdlib_module_names) | {
     *("vlgs", "torch", "lightning", "pytorch_lightning", "hydra", "hydra_plugins", "omegaconf"),
     *("numpy", "scipy", "pandas", "PIL", "yaml", "antlr4", "transformers", "matplotlib", "pip"),
 }
-"""Packages that nobody's parts are in; most can do anything."""
+"""Packages that can never be plugins; most of them could run arbitrary code."""
 
 _LOGGING = frozenset({"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"})
 _STREAMS = frozenset({"ext://sys.stdout", "ext://sys.stderr"})

@@ -47,7 +47,7 @@ class Count:
 
 
 def duration(seconds: float) -> str:
-    """Seconds, minutes or hours, whichever reads best.
+    """A duration in seconds, minutes or hours.
 
     Example:
         >>> duration(42.0), duration(600.0), duration(9000.0)

@@ -30,9 +30,9 @@ class ViewBlend(ABC):
     mask: Literal["and", "or"] = "and"
     """Which pixels of the mixed language map count: those where both views have a code, or where either has."""
     renormalise: bool = False
-    """Whether mixed codes get back the length that mixing takes from them."""
+    """Whether mixed codes, which are shorter than the originals, are stretched to the original length."""
     kept: Literal["first", "nearer"] = "first"
-    """Whose rotation or centre stays where one of them is not blended: that of view 1, or of the view whose weight is larger (conf/README.md, D.12)."""
+    """Which view's rotation (or centre) is kept if it is not blended: that of view 1, or of the view with the larger weight (conf/README.md, D.12)."""
     pairs: Literal["uniform", "neighbours"] = "uniform"
     """Whether the second view of an iteration is any other, or one of the nearest (conf/README.md, D.13)."""
     neighbours: int = 4

@@ -22,7 +22,7 @@ from vlgs.values import require_range
 log = logging.getLogger(__name__)
 
 FORMAT = "vlgs-autoencoder-3"
-"""Part of the cache key: a change of the code that moves the weights changes it."""
+"""Part of the cache key; to be changed whenever a change of the code changes the fitted weights."""
 EMPTY_CODES, EMPTY_LENGTH = 32, 0.15
 """Codes that `AutoencoderTraining.empty` looks at in a step, and the length of the longest: well under `min_coverage`."""
 CHECKS = 5
@@ -30,7 +30,7 @@ CHECKS = 5
 WIDEST = 8192
 """Two layers of this width take half a gigabyte."""
 MEASURED = 8192
-"""Most embeddings that a measurement looks at, evenly spaced among the sorted ones: of 81 000 it would cost more than the fit."""
+"""Most embeddings that a measurement uses, evenly spaced among the sorted ones. Measuring all of 81 000 would take longer than the fit."""
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ def _distinct(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Matrices this small gain nothing from a second thread, lose much where cores are shared, and differ in bits."""
+    """Run on one thread: matrices this small gain nothing from a second one, are slower on shared cores, and their last bits depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -35,7 +35,7 @@ class Split:
 
     @property
     def name(self) -> str:
-        """As it stands in the name of a protocol."""
+        """The rule's name, which becomes part of the protocol's name."""
         return f"llff{self.every}" if self.kind == "llff" else self.kind
 
     def divide(

@@ -142,7 +142,7 @@ class ViewSource:
         return torch.from_numpy(self.warp(self.labels.read_ids(self.name), fill=IGNORE_ID))
 
     def _require_size(self, pixels: Tensor) -> None:
-        """The file may have been replaced since its header was read."""
+        """Raise an error if the size has changed since the header was read: the file was replaced."""
         got = (pixels.shape[1], pixels.shape[0])
         if got != self.lens.file_size:
             what = f"size must still be {self.lens.file_size}, got {got}"

@@ -19,7 +19,7 @@ from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
 
 CELLS = (4, 16)
-"""A view is looked through in squares, so many across its longer side: half the square root of the points in it, within these."""
+"""Smallest and largest number of squares across the longer side of a view; the number is half the square root of the points in it."""
 CAMERA_SHARE, POINT_SHARE = 10.0, 2.0
 """Radius of the sphere: the larger of so many scene extents and so many times the distance within which 19 of 20 points lie."""
 MAX_VIEWS = 64

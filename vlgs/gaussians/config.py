@@ -61,7 +61,7 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class GaussiansConfig:
-    """What the Gaussians of a scene carry and how they start."""
+    """Which values each Gaussian has, and how they start."""
 
     color: Literal["rgb_dc", "rgb", "evaluated"] = "rgb_dc"
     """Colour that is fused with language (conf/README.md, D.7): the RGB of degree 0, to which the other degrees are added after fusion; RGB
@@ -76,7 +76,7 @@ class GaussiansConfig:
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
-    """Directions all around in which a far Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
+    """Number of far Gaussians behind everything, spread over all directions (`vlgs.gaussians.background`); 0: none."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""

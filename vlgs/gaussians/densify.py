@@ -163,7 +163,7 @@ def reset_opacity(
 
 
 def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
-    """Gaussians that no image would miss, and those that are not Gaussians at all."""
+    """Gaussians that are too faint to matter, and those with broken parameters."""
     indicator, opacity = params["indicator_logits"].sigmoid(), params["opacity_logits"].sigmoid()
     if indicator.dim() == 2:  # one level that needs a Gaussian keeps it
         indicator = indicator.amax(dim=1)
@@ -187,7 +187,7 @@ def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n
 def _spare(
     doomed: Bool[Tensor, " n"], merit: Float[Tensor, " n"], finite: Bool[Tensor, " n"] | None = None
 ) -> Bool[Tensor, " n"]:
-    """Take the best of the doomed back where fewer than `MIN_COUNT` would be left."""
+    """Keep the best of those to be pruned if fewer than `MIN_COUNT` would be left."""
     able = torch.ones_like(doomed) if finite is None else finite
     alive = int((able & ~doomed).sum())
     floor = min(MIN_COUNT, int(able.sum()))

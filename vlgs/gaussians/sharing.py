@@ -12,7 +12,7 @@ class Sharing:
     """
 
     means: bool = True
-    """Off: two sets of Gaussians, each trained by the losses of its modality alone."""
+    """Off: two sets of Gaussians, one for colour and one for language, each trained by its own losses."""
     covariances: bool = True
     """Off: a second rotation and scale per Gaussian, with which language is blended."""
     lifted: bool = False

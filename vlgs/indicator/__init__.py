@@ -12,7 +12,7 @@ from vlgs.types import Gaussians
 
 @runtime_checkable
 class Indicator(Protocol):
-    """The whole contract."""
+    """The interface of an indicator."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
         """Return the weight in [0, 1] with which each Gaussian's language code is blended; one per level where they differ."""

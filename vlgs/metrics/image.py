@@ -88,4 +88,4 @@ def _ssim_zero_padded(a: Float[Tensor, "1 c h w"], b: Float[Tensor, "1 c h w"]) 
 
 
 NO_LPIPS = "LPIPS needs a pretrained AlexNet or VGG from torchvision (also in torchmetrics, lpips and piq), which is not a dependency"
-"""Why `lpips` is not available in any result."""
+"""The reason in every result why `lpips` is missing."""

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Parts:
-    """The points chosen on the axes; one field per configuration group."""
+    """The chosen parts of a run; one field per configuration group."""
 
     gaussians: GaussiansConfig
     sharing: Sharing

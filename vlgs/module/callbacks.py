@@ -72,7 +72,7 @@ class OwnFolder(L.Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Look."""
+        """Check that the folder is still the same."""
         self.folder.require_own()
 
 
@@ -86,7 +86,7 @@ class Checkpoints(L.Callback):
         self.saved: int | None = None
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """What is resumed from is saved already."""
+        """Note that the resumed step is saved already."""
         self.saved = _own(pl_module).next_step
 
     def on_train_batch_end(
@@ -141,7 +141,7 @@ class CurveLog(L.Callback):
         self.every = every
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Keep the rows up to the step that is resumed from; later ones will come again."""
+        """Keep the rows up to the resumed step; later ones will be written again."""
         step, rows = _own(pl_module).next_step, []
         if self.path.is_file() and step > 0:
             rows = [row for row in read_rows(self.path) if int(row[0]) <= step]
@@ -298,7 +298,7 @@ class GracefulStop(L.Callback):
 
 
 def _leave_closed_terminal(terminals: list[int]) -> None:
-    """Let what would be printed on a terminal that is no more go nowhere; it must not end what is being saved."""
+    """Discard output to a closed terminal, so that an error of writing does not interrupt saving."""
     for descriptor in terminals:
         if not os.isatty(descriptor):
             nowhere = os.open(os.devnull, os.O_WRONLY)

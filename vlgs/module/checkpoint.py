@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = "vlgs-checkpoint-2"
 FIRST_FORMAT = "vlgs-checkpoint-1"
-"""Its digest, of the whole file, stands in ``latest.json`` beside it."""
+"""Format of the first checkpoints, whose digest is in ``latest.json`` beside them."""
 KEPT = 2
 _NAME = re.compile(r"step_(\d+)\.safetensors")
 
@@ -39,7 +39,7 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint; of those before it the newest stays.
+    """Write a checkpoint, and keep only the newest of the earlier ones.
 
     Raises:
         OSError: If the disk is full or read-only; the previous checkpoint is then untouched.

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from vlgs.values import require_range
 
 MOST_ITERATIONS = 10**9
-"""A thousand times what anybody trains."""
+"""Upper limit of `iterations`, far above any useful value."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class Work:
 
     done: int = 0
     seconds: float = 0.0
-    """Wall time of the forward part; what it adds to the backward pass is not known apart."""
+    """Wall time of the forward pass; its share of the backward pass cannot be measured separately."""
 
 
 @dataclass

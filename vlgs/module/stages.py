@@ -76,7 +76,7 @@ class Stages:
 
     @property
     def kept(self) -> list[Stage]:
-        """What the result is made of: all but the models that others were made from."""
+        """The stages that the result consists of, without those that only prepared others."""
         return [stage for name, stage in self.done.items() if name not in (AUGMENT, GEOMETRY)]
 
     def train(self, name: str, scene: Scene, color: bool = True) -> SplatModel:
@@ -182,7 +182,7 @@ def train_all(
 
 
 def all_skips(stages: Iterable[Stage]) -> SkipCount:
-    """What all stages left out together."""
+    """The skips of all stages together."""
     total = SkipCount()
     for stage in stages:
         for name, work in stage.skips.work.items():

@@ -16,7 +16,7 @@ CLIP_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 
 @runtime_checkable
 class TextEncoder(Protocol):
-    """Words to unit vectors: the whole contract. Options under conf/text are called with ``vocabulary=scene.vocabulary``."""
+    """The interface of a text encoder: words to unit vectors. Options under conf/text are called with ``vocabulary=scene.vocabulary``."""
 
     def encode(self, names: Sequence[str]) -> Float[Tensor, "k e"]:
         """One unit vector per word, in the order given.

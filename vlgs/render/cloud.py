@@ -21,7 +21,7 @@ HIGHEST_LOGIT = log(2.0**24 - 1)
 ROWS = 1 << 13
 """Gaussians whose harmonics are fitted at once: bounds the memory."""
 RIDGE = 1e-3
-"""Cost of a fitted harmonic beside the mean squared error over the views: what no view tells stays as it is."""
+"""Regularisation of the fitted harmonics: those that no view determines keep their value."""
 
 
 @dataclass(frozen=True)

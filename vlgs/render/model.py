@@ -53,7 +53,7 @@ class ViewRender:
 
 
 class SplatModel(nn.Module):
-    """What a checkpoint holds and an evaluation needs.
+    """A trained scene: the parameters in a checkpoint, and everything that is needed to render.
 
     Args:
         parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`, with or without `LANGUAGE_SHAPE`.

@@ -123,7 +123,7 @@ def _damaged(path: Path, line: int, got: object) -> str:
 
 
 def add_kept(found: Sequence[Line], results: Path) -> list[Line]:
-    """The lines of all runs that have a folder, and those of runs.csv of runs that have none: published results outlive their folders.
+    """The lines of all runs that have a folder and, from runs.csv, of runs whose folder is gone.
 
     A run with a folder takes the place of one without that fills the same row, scene and seed.
 
@@ -195,7 +195,7 @@ def write_frame(frame: pd.DataFrame, results: Path) -> None:
 
 
 def require_one_meaning(frame: pd.DataFrame) -> None:
-    """Refuse what must not stand in one table.
+    """Refuse lines that must not be mixed in one table.
 
     Raises:
         ValueError: If two runs claim one recipe, data, scene and seed, or runs of one data set differ in protocol.

@@ -92,7 +92,7 @@ class SparseImage:
 
 @dataclass(frozen=True)
 class SparseModel:
-    """What the three files of one reconstruction say, in their order; not yet judged."""
+    """The content of the three files of a reconstruction, in their order and not yet checked."""
 
     folder: Path
     suffix: str
