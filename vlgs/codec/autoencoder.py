@@ -22,7 +22,7 @@ from vlgs.values import require_range
 log = logging.getLogger(__name__)
 
 FORMAT = "vlgs-autoencoder-3"
-"""Part of the cache key; to be changed whenever a change of the code changes the fitted weights."""
+"""Part of the cache key: a change of the code that moves the weights changes it."""
 EMPTY_CODES, EMPTY_LENGTH = 32, 0.15
 """Codes that `AutoencoderTraining.empty` looks at in a step, and the length of the longest: well under `min_coverage`."""
 CHECKS = 5

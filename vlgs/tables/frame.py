@@ -195,7 +195,7 @@ def write_frame(frame: pd.DataFrame, results: Path) -> None:
 
 
 def require_one_meaning(frame: pd.DataFrame) -> None:
-    """Refuse lines that must not be mixed in one table.
+    """Refuse what must not stand in one table.
 
     Raises:
         ValueError: If two runs claim one recipe, data, scene and seed, or runs of one data set differ in protocol.

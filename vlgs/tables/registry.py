@@ -83,10 +83,10 @@ class Table:
     rows: tuple[Row, ...]
     by_category: bool = False
     """Columns are the categories of a scene instead of scenes."""
-    kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
-    """Category -> ``translucent_reflective`` or ``other``."""
     number: int | None = None
     """Number of the table in the paper's PDF, by which comments cite it; None for a table of our own."""
+    kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
+    """Category -> ``translucent_reflective`` or ``other``."""
 
     @property
     def runnable(self) -> tuple[Row, ...]:
@@ -165,6 +165,7 @@ def load_table(path: Path) -> Table:
         raise ValueError(f"{where}: rows must be at least 1, got none")
     return Table(
         label=label,
+        number=printed,
         caption=_require(where, content, "caption", str),
         dataset=_require(where, content, "dataset", str),
         scenes=scenes,
@@ -172,7 +173,6 @@ def load_table(path: Path) -> Table:
         rows=rows,
         by_category=by_category,
         kinds=kinds,
-        number=printed,
     )
 
 
