@@ -1,4 +1,4 @@
-"""The configuration: its folder, what it may construct, and the run id that it determines. Imports no torch."""
+"""The configuration: where it lives, what it may construct, and which run it names. Imports no torch."""
 
 import hashlib
 import inspect
@@ -283,12 +283,12 @@ class Identity:
     recipe: str
     """Hash of the configuration without data and seed."""
     data: str
-    """Hash of how the data is read, without its folder and the name of the scene."""
+    """Hash of how the data is read, wherever it lies and whichever scene it is."""
     seed: int
 
 
 def identity(config: DictConfig) -> Identity:
-    """The `Identity` of a configuration."""
+    """What tells runs of a table apart; see `Identity`."""
     moving = _moving(config)
     seed = moving.pop("seed")
     given = {key: config.get(group, {}).get(key) for group, key in GIVEN_FILES}
