@@ -1,7 +1,7 @@
-"""What is minimised: Eqs. raster, blend and overall, and the alternatives that S. D.8 lists.
+"""What is minimised: Eqs. 8, 11 and 12, and alternatives to them (conf/README.md, D.8).
 
-Images and maps are ``[h, w, c]``. A mask says which pixels count; what the target holds at the others is never looked at,
-so that it may be anything, NaN included.
+Images and maps are ``[h, w, c]``. A mask says which pixels count. The target's values at all other pixels are never read; they
+may even be NaN.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from torch.nn.functional import l1_loss
 from vlgs import _csrc
 
 Pixels = Literal["valid", "all"]
-"""Whose number an average is divided by: pixels that have a target, or all of them (LangSplat's habit, S. A.2)."""
+"""Whose number an average is divided by: pixels that have a target, or all of them (as LangSplat does)."""
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
@@ -35,7 +35,7 @@ def masked_mse(
     valid: Bool[Tensor, "h w"] | None = None,
     pixels: Pixels = "valid",
 ) -> Float[Tensor, ""]:
-    """Mean squared error over the pixels that count, and over channels; 0 without such a pixel (Eq. raster).
+    """Mean squared error over the pixels that count, and over channels; 0 without such a pixel (Eq. 8).
 
     Raises:
         ValueError: If the shapes differ.
@@ -86,7 +86,7 @@ def masked_cosine(
 
 
 def ssim(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Structural similarity in [-1, 1] of two images in [0, 1], as 3DGS computes it (S. A.1).
+    """Structural similarity in [-1, 1] of two images in [0, 1], as 3DGS computes it.
 
     Gaussian window of 11 x 11 pixels, sigma 1.5, zeros beyond the edge, mean over pixels and channels. Differentiable;
     images smaller than the window are fine.
@@ -129,7 +129,7 @@ def l1_dssim(
     image: Float[Tensor, "h w c"],
     valid: Bool[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """``0.8 L1 + 0.2 (1 - SSIM)``, the loss of 3DGS (S. A.1).
+    """``0.8 L1 + 0.2 (1 - SSIM)``, the loss of 3DGS.
 
     With a mask, both means are over its pixels, and windows that reach beyond it see no difference there.
 
@@ -147,9 +147,9 @@ def l1_dssim(
 
 @torch.no_grad()
 def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c"]) -> float:
-    """``max(0, SSIM(I1, I2))``, the weight of a pair in Eq. blend; a constant of the pair, so worth a cache.
+    """``max(0, SSIM(I1, I2))``, the weight of a pair in Eq. 11; a constant of the pair, so worth a cache.
 
-    SSIM goes down to -1, and a negative weight would reward a wrong render (S. D.12). The bits do not depend on the number
+    SSIM goes down to -1, and a negative weight would reward a wrong render (conf/README.md, D.12). The bits do not depend on the number
     of threads: the mean over a map does, so it is taken on one.
     """
     threads = torch.get_num_threads()
@@ -162,7 +162,7 @@ def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c
 
 @dataclass(frozen=True)
 class Losses:
-    """Which terms Eq. overall is made of; the paper's are the defaults.
+    """The terms of Eq. 12; the defaults are the paper's.
 
     Raises:
         ValueError: If a value is not one of those listed or the weight is negative.
@@ -172,7 +172,7 @@ class Losses:
     lang_loss: Literal["mse", "l1", "cos"] = "mse"
     lang_pixels: Pixels = "valid"
     blend_weight: float = 1.2
-    """lambda of Eq. overall."""
+    """lambda of Eq. 12."""
 
     def __post_init__(self) -> None:
         _require_choice("rgb_loss", self.rgb_loss, ("mse", "l1_dssim"))
@@ -189,7 +189,7 @@ class Losses:
         image: Float[Tensor, "h w 3"],
         valid: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, ""]:
-        """First term of Eq. raster; `valid` are the pixels that the photograph covers."""
+        """First term of Eq. 8; `valid` are the pixels that the photograph covers."""
         return (masked_mse if self.rgb_loss == "mse" else l1_dssim)(color, image, valid)
 
     def language_loss(
@@ -198,7 +198,7 @@ class Losses:
         target: Float[Tensor, "h w d"],
         valid: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Second term of Eq. raster; `valid` are the pixels that have a language code."""
+        """Second term of Eq. 8; `valid` are the pixels that have a language code."""
         return _LANGUAGE[self.lang_loss](feature, target, valid, self.lang_pixels)
 
     def blended_loss(
@@ -208,7 +208,7 @@ class Losses:
         valid: Bool[Tensor, "h w"] | None,
         similarity: float,
     ) -> Float[Tensor, ""]:
-        """``lambda L_b``: what the blended view adds to Eq. overall.
+        """``lambda L_b``: what the blended view adds to Eq. 12.
 
         Args:
             feature: Language rendered from the blended camera.

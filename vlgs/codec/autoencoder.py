@@ -1,4 +1,4 @@
-"""LangSplat's autoencoder of one scene's embeddings, trained in seconds (systems.md A.2, stage 1; C.5)."""
+"""LangSplat's autoencoder of one scene's embeddings, trained in seconds (Qin et al., CVPR 2024)."""
 
 import hashlib
 import json
@@ -28,7 +28,7 @@ CHECKS = 5
 WIDEST = 8192
 """Two layers of this width take half a gigabyte."""
 MEASURED = 8192
-"""Most embeddings that a measurement looks at, evenly spaced among the sorted ones: of 81 000 it would cost more than the fit."""
+"""Most embeddings that a measurement uses, evenly spaced among the sorted ones. Measuring all of 81 000 would take longer than the fit."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ DEFAULT_TRAINING = AutoencoderTraining()
 
 
 class Autoencoder(nn.Module):
-    """A few numbers per Gaussian in place of an embedding of hundreds (systems.md A.2, stage 1).
+    """A few numbers per Gaussian in place of an embedding of hundreds.
 
     Encoder and decoder have LangSplat's layers, names and unit outputs. The loss is one minus the cosine of each
     embedding and its reconstruction. LangSplat's MSE + 0.001 (1 - cos) is a multiple of it between unit vectors, which
@@ -299,7 +299,7 @@ def _distinct(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Matrices this small gain nothing from a second thread, lose much where cores are shared, and differ in bits."""
+    """Run on one thread: matrices this small gain nothing from a second one, are slower on shared cores, and their last bits depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,8 +1,8 @@
 """Gaussians behind everything, so that no ray ends in nothing.
 
-Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training explains such pixels
-by what it has: large, faint ones close to the cameras, which fit every training view and fog all others. And where no training view
-looked, an unseen view would look through the scene into black.
+Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training fits such pixels with
+large, faint Gaussians close to the cameras. These fit every training view and appear as fog in all others. And an unseen view
+that looks where no training view looked would show black.
 
 Where there are points the background stands not far behind them. Training makes what is in front of it half transparent, and
 corrects the colour with what shines through; the farther behind that is, the less the two fit together from another place.
@@ -21,7 +21,7 @@ from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
 
 CELLS = (4, 16)
-"""A view is looked through in squares, so many across its longer side: half the square root of the points in it, within these."""
+"""Smallest and largest number of squares across the longer side of a view; the number is half the square root of the points in it."""
 CAMERA_SHARE, POINT_SHARE = 10.0, 2.0
 """Far is the larger of so many scene extents and so many times the distance within which 19 of 20 points lie."""
 BEHIND, CONE, FEWEST = 1.5, 0.2, 3

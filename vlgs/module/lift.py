@@ -1,4 +1,4 @@
-"""Language codes lifted from the training views onto Gaussians, without training (systems.md D.9, F.4)."""
+"""Language codes lifted from the training views onto Gaussians, without training."""
 
 import torch
 from jaxtyping import Float
