@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import lightning as L
@@ -18,6 +18,7 @@ from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
 from vlgs.module.blended import BlendPlan, CamerasBetween, plan_blend
+from vlgs.module.exposure import Exposure
 from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
 from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.settings import TrainerConfig
@@ -109,6 +110,7 @@ class VLGSModule(L.LightningModule):
         self.mask_codes = self._encode_masks()
         self.target_cache = PixelCache(self._room_for_targets())
         freeze(model, tuple(trainer_config.freeze), gaussians_config.densify.stop)
+        self.exposure = Exposure(len(scene.train)) if trainer_config.exposure and color else None
         self.optimizer = self._make_optimizer()
         self.densify_state = DensifyState.zeros(model.count)
         self.next_step = 0
@@ -147,6 +149,7 @@ class VLGSModule(L.LightningModule):
         plan = None if pair[0] == pair[1] else self._plan_blend(step, first, second)
         fused = self._fuse(targets, plan)
         renders = [self._render(i, t, fused) for i, t in zip(pair, targets, strict=True)]
+        renders = [self._exposed(i, render) for i, render in zip(pair, renders, strict=True)]
         color_losses = [self._color_loss(r, t) for r, t in zip(renders, targets, strict=True)]
         total = sum(color_losses, torch.zeros(()))
         for render, target in zip(renders, targets, strict=True):
@@ -219,6 +222,9 @@ class VLGSModule(L.LightningModule):
             weights = list(self.model.fusion.parameters())
             if weights:
                 groups.append({"params": weights, "lr": rates.fusion, "name": "fusion"})
+        if self.exposure is not None:
+            maps = list(self.exposure.parameters())
+            groups.append({"params": maps, "lr": rates.exposure, "name": "exposure"})
         if not groups:
             raise ValueError("train: trainer.freeze must leave something to train, got everything")
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
@@ -253,6 +259,11 @@ class VLGSModule(L.LightningModule):
         if render.mean2d.requires_grad:
             render.mean2d.retain_grad()
         return render
+
+    def _exposed(self, index: int, render: ViewRender) -> ViewRender:
+        if self.exposure is None or render.color is None:
+            return render
+        return replace(render, color=self.exposure(index, render.color))
 
     def _color_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.color is None:
@@ -342,6 +353,8 @@ class VLGSModule(L.LightningModule):
             yield f"splats.{name}", parameter
         if isinstance(self.model.fusion, nn.Module):
             yield from self.model.fusion.named_parameters("fusion")
+        if self.exposure is not None:
+            yield from self.exposure.named_parameters("exposure")
 
     def _refuse_non_finite(self, where: str) -> None:
         """Stop before Adam spreads one bad number over everything (tests/README.md, N1)."""

@@ -28,6 +28,9 @@ class LearningRates:
     fusion: float = 1e-3
     """The paper is silent (conf/README.md, D.6)."""
 
+    exposure: float = 1e-3
+    """Of the maps of `TrainerConfig.exposure`; 3DGS's last."""
+
     def __post_init__(self) -> None:
         require_range("learning_rates", 0, 1, **asdict(self))
 
@@ -77,6 +80,8 @@ class TrainerConfig:
     """Iterations between checkpoints; 0 writes one only at the end."""
     freeze: Sequence[str] = ()
     """Parameters of the Gaussians that keep their values, names of `vlgs.gaussians.PARAMETERS`."""
+    exposure: bool = False
+    """Whether every training photograph has a gain, white balance and offset of its own (`vlgs.module.exposure`)."""
     skip: SkipConfig = field(default_factory=SkipConfig)
 
     def __post_init__(self) -> None:

@@ -13,6 +13,8 @@ from vlgs.module.lightning import VLGSModule
 def capture(module: VLGSModule, meta: dict[str, Any]) -> Checkpoint:
     """Everything the next iteration depends on: parameters, weights, Adam's moments, densification statistics."""
     tensors: dict[str, Tensor] = {f"model.{k}": v for k, v in module.model.state_dict().items()}
+    if module.exposure is not None:
+        tensors |= {f"exposure.{k}": v for k, v in module.exposure.state_dict().items()}
     for group in module.optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):
             for key, value in module.optimizer.state.get(parameter, {}).items():
@@ -39,6 +41,8 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
     if version != RESULTS_VERSION:
         raise ValueError(f"resume: results version must be {RESULTS_VERSION}, got {version}")
     _restore_model(module, _below(checkpoint.tensors, "model."))
+    if module.exposure is not None:
+        module.exposure.load_state_dict(_below(checkpoint.tensors, "exposure."))
     adam = _below(checkpoint.tensors, "adam.")
     module.optimizer.state.clear()
     for group in module.optimizer.param_groups:
