@@ -1,7 +1,7 @@
 // u = x + out(softmax(Q K^T / sqrt(width)) V) inside every Gaussian, and its derivative. One lane is one
-// Gaussian: every product below is the same instruction for sixteen of them, and what a Gaussian becomes does
-// not depend on its neighbours. Backward computes queries, keys, values and shares again: that is cheaper
-// than to write and read them.
+// Gaussian: every product below is the same instruction for sixteen of them, and the result of a
+// Gaussian does not depend on its neighbours. The backward pass computes queries, keys, values and shares
+// again, which is cheaper than storing them.
 #include <cmath>
 #include <limits>
 

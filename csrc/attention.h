@@ -1,4 +1,4 @@
-// Attention between the channels of one Gaussian (Eq. attention): what the kernel and its callers share.
+// Attention between the channels of one Gaussian (the paper's Eq. 5): what the kernel and its callers share.
 #pragma once
 
 #include <cstdint>

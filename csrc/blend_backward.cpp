@@ -1,6 +1,6 @@
-// The same walk back to front, one Gaussian of a tile at a time over the blocks it reaches, so that what
-// belongs to the Gaussian is summed in registers and leaves them once per tile. README.md derives the
-// recurrences.
+// The backward pass of blending. A tile's Gaussians are visited back to front; for each of them, all 4x4
+// blocks of the tile that it reaches. Its gradients are summed in registers and stored once per tile.
+// csrc/README.md derives the formulas.
 #include "alpha.h"
 
 namespace vlgs::VLGS_ISA_NS {

@@ -1,5 +1,5 @@
-// No number that is not finite gets past the kernel: a fast look everywhere, and a slow one for the name and
-// row of what was found.
+// Refuses input that is not finite. A fast test looks at everything; only if it fails, a slow one finds the
+// name and the row for the error.
 #pragma once
 
 #include <bit>

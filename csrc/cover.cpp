@@ -1,5 +1,5 @@
-// Which tiles a Gaussian may reach, and which 4x4 blocks of their pixels it does: row by row, the pixel
-// centres inside its ellipse are an interval.
+// Finds the tiles that a Gaussian may reach, and the 4x4 blocks in them that it does reach. In each row of
+// pixels, the centres inside of its ellipse are an interval.
 #include "isa.h"
 #include "simd.h"
 

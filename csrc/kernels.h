@@ -151,7 +151,7 @@ struct Pass {
 
 // A slot: gradients of one Gaussian from one tile. Moments are sums over pixels of h, the loss's derivative
 // by the negative exponent, times u, v, u^2, u v, v^2; a chain's own part of the sum of h is weight times the
-// gradient of the weight (README.md). The channels of the parts follow.
+// gradient of the weight (csrc/README.md). The channels of the parts follow.
 enum Slot {
   kMomentU,
   kMomentV,

@@ -1,6 +1,6 @@
-// Gaussians and a camera to ellipses on the image plane, and back (Zwicker et al. 2001). All in double,
-// whatever is stored: this is O(n) work, and a needle's short axis survives nothing less. README.md derives
-// both directions.
+// Gaussians and a camera to ellipses on the image plane, and back (Zwicker et al. 2001). Always
+// computed in double, because in float the short axis of a long thin Gaussian is lost, and n Gaussians are
+// little work. Both directions are derived in csrc/README.md.
 #include "isa.h"
 #include "simd.h"
 

@@ -246,7 +246,7 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads)
   return sums;
 }
 
-// From moments to gradients (README.md), and from ranks to rows.
+// From moments to gradients (csrc/README.md), and from ranks to rows.
 template <class T>
 void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T> &sums,
                                const BlendGrads<T> &d, int threads) const {

@@ -1,4 +1,4 @@
-// How work is divided. What comes out never depends on it.
+// How work is divided among threads. No result depends on it.
 #pragma once
 
 #include <cstdint>

@@ -1,4 +1,4 @@
-// What this machine does at best: multiply-adds with nothing to wait for but each other.
+// The fastest that this machine computes: multiply-adds that wait for nothing but each other.
 #include "isa.h"
 #include "simd.h"
 

@@ -1,4 +1,4 @@
-"""Is this scene usable? `python -m vlgs.check data=colmap data.root=PATH` lists every fault; exit status 1 if one is an error."""
+"""Check a scene: `python -m vlgs.check data=colmap data.root=PATH` lists all its faults; exit status 1 if one is an error."""
 
 import logging
 import os
@@ -64,7 +64,7 @@ def command() -> None:
 
 
 def start(config: DictConfig) -> Iterator[Fault]:
-    """Begin the run: what it would end with at once is an error here."""
+    """Begin the run for a few steps, so that an error at its start is found here."""
     try:
         scenes = prepare(config).scenes
         yield from doubts(config)
@@ -77,7 +77,7 @@ def start(config: DictConfig) -> Iterator[Fault]:
 
 
 def check(data: DictConfig) -> Report:
-    """Look at all that a `data` group leads to, and decode every file once.
+    """Check everything that a `data` group names, and decode every file once.
 
     A COLMAP scene that is at fault in one place is still looked at in all others; another source has files of its own only
     if its loader says so, and one that does not load is one fault.
@@ -115,7 +115,7 @@ def check_scene(scene: Scene) -> Iterator[Fault]:
 
 
 def view_faults(view: View) -> Iterator[Fault]:
-    """Decode everything that one view has, and hold the sizes against its camera."""
+    """Decode all files of one view, and compare their sizes with its camera."""
     size = (view.camera.height, view.camera.width)
     for what, read in _readers(view):
         try:
@@ -158,7 +158,7 @@ def summarize(scene: Scene) -> Iterator[str]:
 
 
 def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
-    """What a run with this configuration may need for its Gaussians, as a line of the summary, and a doubt about it.
+    """Memory that a run with this configuration may need for its Gaussians: a line of the summary, and a warning if it is too much.
 
     Value, gradient and Adam's two moments of every parameter at `gaussians.max_count`; images and activations come on top.
     """

@@ -1,7 +1,7 @@
-"""The command line of `vlgs.run` and `vlgs.check`, read before Hydra: a mistake is one line that says what was meant. Imports no torch.
+"""Checks the command line of `vlgs.run` and `vlgs.check` before Hydra sees it: a mistake gives one line that suggests what was meant. Imports no torch.
 
-Hydra would answer ``trainr=photos`` with "use +trainr=photos", obey that, and run without it; and it constructs callbacks and loggers
-before a task begins. What it is given is therefore composed once here, and looked at.
+Hydra alone would answer ``trainr=photos`` with the advice to write ``+trainr=photos``, which it then accepts and ignores. It also constructs
+callbacks and loggers before a task begins. Therefore the configuration is composed and checked here first.
 """
 
 import sys
@@ -32,7 +32,7 @@ _REFUSED_FLAGS = {
 
 
 def check_command(arguments: Sequence[str], name: str = "config") -> None:
-    """Refuse a command line that cannot be meant, or that would run a stranger's code before the task begins.
+    """Refuse a command line with mistakes, or one that would run foreign code before the task begins.
 
     ``--help`` with options (``data=colmap``) prints the keys of these and exits.
 
@@ -72,7 +72,7 @@ def check_command(arguments: Sequence[str], name: str = "config") -> None:
 
 
 def composed(overrides: Sequence[str], name: str = "config") -> DictConfig:
-    """The configuration of a command line, with the same refusals, for what makes runs by itself.
+    """The configuration of a command line, checked in the same way, for commands that start runs themselves.
 
     Raises:
         ValueError: As `check_command`.
@@ -104,7 +104,7 @@ def _parse(overrides: Sequence[str]) -> list[Override]:
 
 
 def _check_overrides(overrides: Sequence[Override], extra: Path | None) -> None:
-    """Refuse options that are not there and what takes keys away; whether keys are there is seen once the rest is composed."""
+    """Refuse options that do not exist and overrides that delete keys. Whether keys exist is checked after composing."""
     for override in overrides:
         key, said = override.key_or_group, override.input_line
         if override.type == OverrideType.DEL:
@@ -161,7 +161,7 @@ def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
 
 
 def _compose(overrides: Sequence[str], name: str, extra: Path | None, hydra: bool) -> DictConfig:
-    """What Hydra makes of a command line, or what was meant instead."""
+    """Compose a command line; an error suggests what was meant."""
     path = [f"hydra.searchpath=[file://{extra}]"] if extra else []
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -180,7 +180,7 @@ def _compose(overrides: Sequence[str], name: str, extra: Path | None, hydra: boo
 
 
 def _explain(overrides: Sequence[Override], name: str, extra: Path | None) -> None:
-    """Refuse the first key that is not there, in words of ours."""
+    """Raise our own error for the first key that does not exist."""
     chosen = tuple(str(o.input_line) for o in overrides if _options(o.key_or_group, extra))
     known = _keys(name, chosen)
     for override in overrides:
@@ -202,7 +202,7 @@ def _elsewhere(key: str) -> str:
 
 
 def _meant(key: str, known: Collection[str]) -> str:
-    """Keys beside it, of this or another option of its group, or groups, that are spelled much the same."""
+    """Similar names: keys beside it, keys of other options of its group, and groups."""
     above, dot, word = key.rpartition(".")
     group = above.partition(".")[0]
     every = {k for o in options(group) for k in _keys_of(group, o)} if group in groups() else set()
@@ -244,7 +244,7 @@ def _flat(node: Any, key: str) -> Iterator[str]:
 
 
 def _check_plugins(config: DictConfig, overrides: Sequence[Override]) -> None:
-    """Only the command line may trust a package: a file is somebody else's word."""
+    """Refuse trust in packages from files: only the command line may name plugins."""
     named = [o.value() for o in overrides if o.key_or_group == "plugins"]
     given = [str(package) for value in named for package in require_plugins(value)]
     stated = config.get("plugins", [])
@@ -257,7 +257,7 @@ def _check_plugins(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse options of the user's own, or a stranger's, that reach for Hydra or for trust."""
+    """Refuse an option folder that changes Hydra's own settings or names plugins."""
     if not folder.is_dir():
         raise ValueError(f"command: --config-dir must be a folder, got {folder}")
     for path in sorted((*folder.rglob("*.yaml"), *folder.rglob("*.yml"))):

@@ -15,7 +15,7 @@ from vlgs.known import is_ours, join, last, nodes, unread
 from vlgs.values import require_range, require_types
 
 LEVELS = (1, 2, 3)
-"""Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (systems.md D.8)."""
+"""Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (conf/README.md, D.8)."""
 
 OmegaConf.register_new_resolver(
     "code_channels",
@@ -29,7 +29,7 @@ _PER_LEVEL = "vlgs.indicator.PerLevel"
 _NOT_LEARNED = ("vlgs.indicator.ColourOpacity", "vlgs.indicator.Fixed")
 
 MOST_THREADS = 256
-"""More than that no machine of one process has, and starting them fails half-way."""
+"""Largest number of threads; no machine has more, and starting them would fail half-way."""
 
 
 def check_config(config: DictConfig) -> None:
@@ -101,7 +101,7 @@ def _unresolved(error: OmegaConfBaseException) -> ValueError:
 
 
 def _check_root(config: DictConfig) -> None:
-    """The keys of the root, which no constructor looks at."""
+    """Check the keys of the root, which no constructor checks."""
     hints = {
         "seed": int,
         "threads": int,
@@ -127,7 +127,7 @@ def instantiate(config: Any, **arguments: Any) -> Any:
     """Construct what a `_target_` names; its arguments have the types that it asks for, and a plugin's part is really a plugin's.
 
     Raises:
-        ValueError: If a name is neither ours nor that of something in a plugin (`vlgs.data.os.system`), an argument is missing or has
+        ValueError: If a name is neither ours nor that of something in a plugin (as in ``vlgs.data.<module>.os.system``), an argument is missing or has
             another type, or the constructor says so itself, without Hydra's wrapping.
         OSError: Likewise.
     """
@@ -162,7 +162,7 @@ def instantiate(config: Any, **arguments: Any) -> Any:
 
 
 def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, Any]) -> None:
-    """Hold arguments against a constructor's signature; parts that stand in them are judged by themselves."""
+    """Compare arguments with a constructor's signature; nested parts are checked separately."""
     values = {k: v for k, v in given.items() if k not in ("_target_", "_partial_")}
     signature = inspect.signature(made)
     try:
@@ -179,7 +179,7 @@ def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, A
 
 
 def _who(config: Any, key: str, target: str) -> str:
-    """The group in whose name a part speaks: that of its key, else its own."""
+    """The name in errors of a part: its group, taken from its key or else from its module."""
     return last(key) or last(str(config._get_full_key(None) or "")) or target.rpartition(".")[2]
 
 

@@ -45,7 +45,7 @@ def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
 
 
 def write_changed(path: Path, data: bytes) -> None:
-    """`write_atomically`, unless the file holds just that: a file that stays need not wait for the disk."""
+    """`write_atomically`, unless the file has this content already, which saves waiting for the disk."""
     if not path.is_file() or path.read_bytes() != data:
         write_atomically(path, data)
 

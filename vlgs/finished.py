@@ -1,4 +1,4 @@
-"""metrics.json of a finished run, read and checked: whoever reads it can rely on what its entries are. Imports no torch."""
+"""Reads metrics.json of a finished run and checks the type of every entry. Imports no torch."""
 
 import json
 import math
@@ -57,7 +57,7 @@ def is_number(value: Any) -> bool:
 
 
 def _faults(content: Any) -> Iterator[tuple[str, str, Any]]:
-    """What must be what and is not."""
+    """Entries with a wrong type or range: name, what it must be, what it is."""
     if not isinstance(content, dict):
         yield "content", "an object of metrics", type(content).__name__
         return
@@ -83,7 +83,7 @@ def _faults(content: Any) -> Iterator[tuple[str, str, Any]]:
 
 
 def _faults_within(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
-    """The same of the entries that are objects."""
+    """The same for the values inside of entries that are objects."""
     for category, value in (content.get("per_category") or {}).items():
         if not _is_known(value):
             yield f"per_category.{category}", "a finite number or null", value

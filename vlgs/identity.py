@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vlgs.known import is_group, join, last, option, targets
 
-RESULTS_VERSION = 3
+RESULTS_VERSION = 4
 """Part of every run id; raised by a change that can move a number."""
 
 _MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
@@ -61,14 +61,12 @@ GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
 AS_WITHOUT: Mapping[str, Any] = {
-    "codec.training.empty": 0,
     "gaussians.background": 0,
-    "loss.absent_weight": 0,
     "trainer.skip.finite_check": False,
     "trainer.skip.fuse_visible": False,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while
-they have; the default may be another. An entry stays as it is, since changing it gives all runs other ids."""
+they have; the default may be another. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What `conf` knows: its groups and options, the keys that are read, the parts that a ``_target_`` may name. Imports no torch.
+"""What is in `conf`: groups and options, the keys that exist, and the targets that may be constructed. Imports no torch.
 
 A file of `conf` mirrors the arguments of the class that it names, so that these files are the schema of the configuration.
 """

@@ -1,7 +1,7 @@
-"""What is minimised: Eqs. raster, blend and overall, and the alternatives that S. D.8 lists.
+"""What is minimised: Eqs. 8, 11 and 12, and alternatives to them (conf/README.md, D.8).
 
-Images and maps are ``[h, w, c]``. A mask says which pixels count; what the target holds at the others is never looked at,
-so that it may be anything, NaN included.
+Images and maps are ``[h, w, c]``. A mask says which pixels count. The target's values at all other pixels are never read; they
+may even be NaN.
 """
 
 from dataclasses import dataclass
@@ -17,15 +17,13 @@ from torch.nn.functional import l1_loss
 from vlgs import _csrc
 
 Pixels = Literal["valid", "all"]
-"""Whose number an average is divided by: pixels that have a target, or all of them (LangSplat's habit, S. A.2)."""
+"""Whose number an average is divided by: pixels that have a target, or all of them (as LangSplat does)."""
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 L1_SHARE = 0.8
-ABSENT_LENGTH = 0.5
-"""Length of a code, 1 where a mask gave it, from which the absence of a mask is taken for a mask that was missed."""
 RENDER_FLOOR = 1e-2
 """Shorter renders are treated as this long in `masked_cosine`: codes start at zero, where a cosine has no slope."""
 TARGET_FLOOR = 1e-6
@@ -37,7 +35,7 @@ def masked_mse(
     valid: Bool[Tensor, "h w"] | None = None,
     pixels: Pixels = "valid",
 ) -> Float[Tensor, ""]:
-    """Mean squared error over the pixels that count, and over channels; 0 without such a pixel (Eq. raster).
+    """Mean squared error over the pixels that count, and over channels; 0 without such a pixel (Eq. 8).
 
     Raises:
         ValueError: If the shapes differ.
@@ -88,7 +86,7 @@ def masked_cosine(
 
 
 def ssim(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Structural similarity in [-1, 1] of two images in [0, 1], as 3DGS computes it (S. A.1).
+    """Structural similarity in [-1, 1] of two images in [0, 1], as 3DGS computes it.
 
     Gaussian window of 11 x 11 pixels, sigma 1.5, zeros beyond the edge, mean over pixels and channels. Differentiable;
     images smaller than the window are fine.
@@ -131,7 +129,7 @@ def l1_dssim(
     image: Float[Tensor, "h w c"],
     valid: Bool[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """``0.8 L1 + 0.2 (1 - SSIM)``, the loss of 3DGS (S. A.1).
+    """``0.8 L1 + 0.2 (1 - SSIM)``, the loss of 3DGS.
 
     With a mask, both means are over its pixels, and windows that reach beyond it see no difference there.
 
@@ -149,9 +147,9 @@ def l1_dssim(
 
 @torch.no_grad()
 def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c"]) -> float:
-    """``max(0, SSIM(I1, I2))``, the weight of a pair in Eq. blend; a constant of the pair, so worth a cache.
+    """``max(0, SSIM(I1, I2))``, the weight of a pair in Eq. 11; a constant of the pair, so worth a cache.
 
-    SSIM goes down to -1, and a negative weight would reward a wrong render (S. D.12). The bits do not depend on the number
+    SSIM goes down to -1, and a negative weight would reward a wrong render (conf/README.md, D.12). The bits do not depend on the number
     of threads: the mean over a map does, so it is taken on one.
     """
     threads = torch.get_num_threads()
@@ -164,7 +162,7 @@ def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c
 
 @dataclass(frozen=True)
 class Losses:
-    """Which terms Eq. overall is made of; the paper's are the defaults.
+    """The terms of Eq. 12; the defaults are the paper's.
 
     Raises:
         ValueError: If a value is not one of those listed or the weight is negative.
@@ -173,21 +171,17 @@ class Losses:
     rgb_loss: Literal["mse", "l1_dssim"] = "mse"
     lang_loss: Literal["mse", "l1", "cos"] = "mse"
     lang_pixels: Pixels = "valid"
-    absent_weight: float = 0.0
-    """What a pixel without a mask counts for, which is drawn to the zero code, "nothing"; 0, the default: it teaches nothing. At 0.5 a sky
-    that no mask claims answers fewer words, and a room, where a pixel lacks a mask because it was missed, is segmented worse."""
     blend_weight: float = 1.2
-    """lambda of Eq. overall."""
+    """lambda of Eq. 12."""
 
     def __post_init__(self) -> None:
         _require_choice("rgb_loss", self.rgb_loss, ("mse", "l1_dssim"))
         _require_choice("lang_loss", self.lang_loss, tuple(_LANGUAGE))
         _require_choice("lang_pixels", self.lang_pixels, ("valid", "all"))
-        for name in ("blend_weight", "absent_weight"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise ValueError(
-                    f"Losses: {name} must be finite and >= 0, got {getattr(self, name)}"
-                )
+        if not 0 <= self.blend_weight < float("inf"):
+            raise ValueError(
+                f"Losses: blend_weight must be finite and >= 0, got {self.blend_weight}"
+            )
 
     def color_loss(
         self,
@@ -195,7 +189,7 @@ class Losses:
         image: Float[Tensor, "h w 3"],
         valid: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, ""]:
-        """First term of Eq. raster; `valid` are the pixels that the photograph covers."""
+        """First term of Eq. 8; `valid` are the pixels that the photograph covers."""
         return (masked_mse if self.rgb_loss == "mse" else l1_dssim)(color, image, valid)
 
     def language_loss(
@@ -204,19 +198,8 @@ class Losses:
         target: Float[Tensor, "h w d"],
         valid: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Second term of Eq. raster; `valid` are the pixels that have a language code."""
+        """Second term of Eq. 8; `valid` are the pixels that have a language code."""
         return _LANGUAGE[self.lang_loss](feature, target, valid, self.lang_pixels)
-
-    def absent_loss(
-        self, feature: Float[Tensor, "h w d"], absent: Bool[Tensor, "h w"]
-    ) -> Float[Tensor, ""]:
-        """Squared length of the codes where no mask lies, per number of the whole image: few such pixels count little.
-
-        A long code comes from masks of other views, which know better: the error stops growing from `ABSENT_LENGTH` on.
-        """
-        square, limit = feature.square().sum(dim=-1), ABSENT_LENGTH**2
-        error = (square * limit / (square + limit)).masked_fill(~absent, 0)
-        return self.absent_weight * error.sum() / max(feature.numel(), 1)
 
     def blended_loss(
         self,
@@ -225,7 +208,7 @@ class Losses:
         valid: Bool[Tensor, "h w"] | None,
         similarity: float,
     ) -> Float[Tensor, ""]:
-        """``lambda L_b``: what the blended view adds to Eq. overall.
+        """``lambda L_b``: what the blended view adds to Eq. 12.
 
         Args:
             feature: Language rendered from the blended camera.

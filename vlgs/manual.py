@@ -1,4 +1,4 @@
-"""What `--help` says of an option: its keys, their defaults and what the comments of its file say. Imports no torch."""
+"""The text of `--help` for an option: its keys, their defaults and the comments of its file. Imports no torch."""
 
 import re
 from collections.abc import Iterator

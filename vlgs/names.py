@@ -1,4 +1,4 @@
-"""Names of files for text of strangers: of classes, views and scenes. Imports no torch."""
+"""Safe file names for names from others, such as those of classes, views and scenes. Imports no torch."""
 
 import hashlib
 import re
@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 LONGEST = 100
-"""Bytes; disks take 255, and what belongs to the name stands before and after it."""
+"""Longest name in bytes. File systems allow 255, and prefix and suffix are added to the name."""
 
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that are devices on Windows, whatever comes after a dot."""
@@ -55,5 +55,5 @@ def _hashed(text: str, name: str, taken: set[str]) -> str:
 
 
 def _same(name: str) -> str:
-    """What two names share that some file system takes for one."""
+    """A key that is equal for names which some file system takes for the same."""
     return unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())

@@ -1,8 +1,7 @@
-"""What a run writes down about its configuration, without the folders and the user's name of the machine it ran on.
+"""Records the configuration of a run without the folders and the user's name of this machine.
 
-Settings count, not where a machine keeps its files. A path under the results folder becomes ``${results}/...``, one under the current
-folder is said from there, one in the user's home from ``~``; of any other absolute path its last part is kept. `found_again` is the
-way back for whoever opens a run folder.
+A path below the results folder becomes ``${results}/...``, one below the current folder becomes relative, one in the user's home
+begins with ``~``; of any other absolute path only the last part is kept. `found_again` turns recorded paths into real ones.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Everything that `vlgs.run` does before its first step, and `vlgs.check` too: what one refuses the other refuses, in the same words."""
+"""Everything that a run does before its first step. `vlgs.run` and `vlgs.check` share it, so that both refuse the same things with the same words."""
 
 import logging
 import os
@@ -66,7 +66,7 @@ def prepare(config: DictConfig) -> Prepared:
 
 
 def doubts(config: DictConfig) -> Iterator[Fault]:
-    """Settings that can be had but are hardly meant; `vlgs.check` lists them, `vlgs.run` logs them."""
+    """Warnings about settings that are allowed but probably not intended; `vlgs.check` lists them, `vlgs.run` logs them."""
     for name, rate in config.trainer.learning_rates.items():
         if rate == 0:
             what = "learning rate should be above 0, got 0"
@@ -80,7 +80,7 @@ def doubts(config: DictConfig) -> Iterator[Fault]:
 
 
 def text_encoder(config: DictConfig, scene: Any) -> Any:
-    """What turns the scene's classes into vectors; None where nothing can be asked.
+    """The text encoder for the scene's words; None if there is nothing to ask.
 
     Raises:
         ValueError: If a class or a negative is a word that it does not know: an error now, not after training.
@@ -123,7 +123,7 @@ def make_stages(folder: Any, config: DictConfig, scenes: Scenes) -> Any:
 
 
 def rehearse(config: DictConfig, scenes: Scenes) -> None:
-    """Begin a run in a folder that is thrown away: encode the words, build every model, train each for two steps, score a view.
+    """Try a run in a temporary folder: encode the words, build every model, train each for two steps, score a view.
 
     Raises:
         ValueError: What the run would end with.

@@ -54,7 +54,7 @@ def command() -> None:
 
 @contextmanager
 def _whole_errors() -> Iterator[None]:
-    """Have Hydra raise the error of a multirun, which it would end with half of a traceback."""
+    """Make Hydra raise the error of a multirun; by itself it would print half of a traceback and exit."""
     before = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
@@ -84,7 +84,7 @@ def _errors_in_a_line() -> Iterator[None]:
 
 
 def run(config: DictConfig) -> int:
-    """Do one run or take up one that was left; see `main`.
+    """Do one run, or continue one that was interrupted; see `main`.
 
     Returns:
         The exit status: 0 when the results are there, else `STOPPED` or `UNSCORED`.
@@ -103,7 +103,7 @@ def run(config: DictConfig) -> int:
 
 @contextmanager
 def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
-    """Leave nothing of a run that is refused before its first iteration."""
+    """Remove the folder of a run that is refused before its first iteration."""
     try:
         yield
     except (ValueError, OSError, FloatingPointError):
@@ -157,7 +157,7 @@ def _report(
     stages: Any,
     text: Any,
 ) -> dict[str, Any]:
-    """Everything that is said about trained models; metrics.json is written last and makes the run a finished one."""
+    """Evaluate the trained models and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished."""
     from vlgs.gaussians import write_ply
     from vlgs.module.stages import all_skips
     from vlgs.render.cloud import point_cloud
@@ -214,13 +214,13 @@ def _report(
 
 
 def _places(folder: RunFolder) -> dict[str, Path]:
-    """What the summary points at."""
+    """Files that the summary lists, as far as they exist."""
     places = {"run": folder.path, "pictures": folder.renders / "overview.png", "model": folder.ply}
     return {name: path for name, path in places.items() if path.exists()}
 
 
 def _dataset(config: DictConfig) -> str:
-    """Option of conf/data; where nobody chose one on a command line, the module that reads it."""
+    """The chosen option of conf/data; without a command line, the name of the module that reads the scene."""
     if HydraConfig.initialized():
         return str(HydraConfig.get().runtime.choices["data"])
     return str(config.data._target_).split(".")[-2]

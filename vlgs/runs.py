@@ -1,4 +1,4 @@
-"""Run folders: where the files of a run lie, and who may write them. Imports no torch.
+"""Run folders: where the files of a run are, and the lock that lets one process write them. Imports no torch.
 
     <results>/runs/<run id>/  config.yaml  metrics.json  queries.json  log.csv  checkpoint/  renders/  point_cloud.ply
 

@@ -1,7 +1,7 @@
-"""Everything that the code may leave out, in one table that the benchmark and the documentation both read.
+"""The work that the code may leave out. The benchmark measures this table and the documentation prints it.
 
 A skip is *exact* (the same numbers, to the bit or to float order), *bounded* (off by at most what `Skip.bound` says) or
-*statistical*. One that costs nothing and loses nothing has no switch; it stands here because it explains the speed.
+*statistical*. A skip without a switch always pays and changes nothing; it is listed because it explains the speed.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ class Skip:
     off: Value
     """Value of the key with which it is done."""
     default: Literal["on", "off"]
-    """What a run does that says nothing."""
+    """Whether the work is left out where a run does not set the key."""
     kind: Literal["exact", "bounded", "statistical"]
     bound: str
     """Exact: ``same bits`` or ``<= 1e-6``. Bounded: the formula in words."""
@@ -33,7 +33,7 @@ class Skip:
 
     @property
     def switchable(self) -> bool:
-        """Whether the work can be done all the same, to see what leaving it out saves."""
+        """Whether there is a key that turns the skip off, so that its saving can be measured."""
         return bool(self.setting)
 
     def override(self, on: bool) -> str:
@@ -78,23 +78,23 @@ SKIPS: tuple[Skip, ...] = (
         "early_stop", "raster.transmittance_min", 1e-4, 0.0, "on", "bounded",
         "stop=after: transmittance_min * largest value; stop=before: that / (1 - alpha_max)",
         "What lies behind a pixel's transmittance_min is not blended; per group, and a block ends when all its groups have.",
-        "3DGS; the bound: pitfall of stopping before",
+        "3DGS; the bound: tests/README.md, N10",
     ),
     Skip(
         "fuse_visible", "trainer.skip.fuse_visible", True, False, "off", "exact", "<= 1e-6",
         "Gaussians outside all views of an iteration are not fused.",
-        "the fusion of a Gaussian depends on itself alone (Eq. attention)",
+        "the fusion of a Gaussian depends on itself alone (Eq. 5)",
     ),
     Skip(
         "blend_zero", "trainer.skip.blend_weight", 0.0, -1.0, "on", "exact", "same bits",
         "The blended view is not rendered where lambda * SSIM(I1, I2) is 0.",
-        "Eq. blend, SSIM clamped at 0",
+        "Eq. 11, SSIM clamped at 0",
     ),
     Skip(
         "blend_small", "trainer.skip.blend_weight", 0.5, 0.0, "off", "bounded",
         "the loss changes by at most blend_weight * MSE of the blended view",
         "The blended view is not rendered where lambda * SSIM(I1, I2) <= blend_weight.",
-        "Eq. blend",
+        "Eq. 11",
     ),
     Skip(
         "blend_reuse", "trainer.skip.blend_reuse", 0.01, 0.0, "off", "bounded",
@@ -130,12 +130,12 @@ SKIPS: tuple[Skip, ...] = (
     _always(
         "unused_modality", "same bits",
         "A blended view renders language alone; a scene or view without language renders colour alone, unfused.",
-        "Eq. overall",
+        "Eq. 12",
     ),
     _always(
         "similarity_cache", "same bits",
         "SSIM(I1, I2) is a constant of a pair and computed once.",
-        "Eq. blend",
+        "Eq. 11",
     ),
     _always(
         "sh_degree", "same bits",
@@ -189,7 +189,7 @@ def turn(names: Iterable[str], on: bool) -> tuple[str, ...]:
 
 
 def markdown_table() -> str:
-    """`SKIPS` as README.md shows them."""
+    """`SKIPS` as conf/README.md shows them."""
     rows = []
     for s in SKIPS:
         switch = f"`{s.setting}`: {_value(s.on)} / {_value(s.off)}" if s.switchable else "always on"

@@ -1,7 +1,7 @@
-"""What a ``_target_`` may name, decided by the name alone, before anything is imported. Imports no torch.
+"""Decides which ``_target_`` may be constructed, by its name alone and before anything is imported. Imports no torch.
 
-Ours are those that stand in `conf`, each at a key of its own name: a fusion where a fusion is expected, never a loader of data.
-Others are in a package that the command line trusts: ``plugins=[my_lab]``.
+Allowed are the targets in `conf`, each at the key where it stands there (a fusion where a fusion is expected), and those of packages that
+the command line trusts: ``plugins=[my_lab]``.
 """
 
 import sys
@@ -14,7 +14,7 @@ _NOT_PLUGINS = frozenset(sys.stdlib_module_names) | {
     *("vlgs", "torch", "lightning", "pytorch_lightning", "hydra", "hydra_plugins", "omegaconf"),
     *("numpy", "scipy", "pandas", "PIL", "yaml", "antlr4", "transformers", "matplotlib", "pip"),
 }
-"""Packages that nobody's parts are in; most can do anything."""
+"""Packages that can never be plugins; most of them could run arbitrary code."""
 
 _LOGGING = frozenset({"logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"})
 _STREAMS = frozenset({"ext://sys.stdout", "ext://sys.stderr"})

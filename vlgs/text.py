@@ -1,6 +1,6 @@
-r"""Text of strangers (names of classes, scenes and machines, labels, captions) where it would be read as something else.
+r"""Escapes text from others (names of classes, scenes and machines, labels, captions), so that no reader takes it for commands.
 
-Each function writes for one reader: a terminal, a spreadsheet, LaTeX, Markdown, a plot. Ordinary text comes out as it is. Imports no
+There is one function for each kind of output: terminal, spreadsheet, LaTeX, Markdown, plot. Ordinary text stays unchanged. Imports no
 torch.
 """
 

@@ -133,7 +133,7 @@ class Gaussians:
     opacities: Float[Tensor, " n"]
     """Colour opacity o in [0, 1]."""
     indicators: Float[Tensor, " n *levels"]
-    """Semantic indicator l in [0, 1] (Eq. lancity); one per mask level with ``indicator=per_level``."""
+    """Semantic indicator l in [0, 1] (Eq. 6); one per mask level with ``indicator=per_level``."""
     sh0: Float[Tensor, "n 3"]
     """Degree-0 spherical harmonics coefficient; RGB = 0.5 + 0.28209479 * sh0."""
     shN: Float[Tensor, "n s 3"]  # noqa: N815 (gsplat's name)
@@ -141,12 +141,12 @@ class Gaussians:
     features: Float[Tensor, "n d"]
     """Language code f; those of all mask levels side by side with ``levels=joint``."""
     language_shape: Shape | None = None
-    """Covariance that language is blended with; None where it is colour's (``sharing=pos``, tab:ab-seperate)."""
+    """Covariance that language is blended with; None where it is colour's (``sharing=pos``, Table 17)."""
 
 
 @dataclass(frozen=True)
 class ChannelGroup:
-    """Channels that are blended with one weight per Gaussian and one transmittance per pixel (Eqs. rgb-render, lancity)."""
+    """Channels that are blended with one weight per Gaussian and one transmittance per pixel (Eqs. 1 and 6)."""
 
     values: Float[Tensor, "n c"]
     """What is blended: colour, language code, ids, CLIP vectors; any c >= 1."""
@@ -175,13 +175,13 @@ class RasterConfig:
     stop: Literal["after", "before"] = "after"
     """Whether the contribution that crosses `transmittance_min` is still included; ``before`` is 3DGS's."""
     fov_margin: float = 0.3
-    """Slack of the x/z, y/z clamp in the projection's Jacobian, as a share of half the image: x/z is kept in
-    ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]`` with m this value. The clamp follows the image: a crop (a smaller image with
-    its principal point shifted) clamps earlier than the whole, so that Gaussians further than m W/2 outside the crop are drawn with
-    another shape where they reach into it. Crops equal the whole to rounding for those within the margin, and for all with 1e6."""
+    """How far outside the image a centre may lie, as a share m of half the image, before the projection's Jacobian is clamped:
+    x/z is kept in ``[-(cx + m W/2) / fx, (W - cx + m W/2) / fx]``, y/z likewise. The bounds depend on the size of the image. A crop
+    of a view therefore draws Gaussians that lie further than m W/2 outside of the crop with a slightly different shape; with 1e6
+    nothing is clamped, and a crop equals the same part of the whole image up to rounding."""
     memory_budget: int = 2 << 30
-    """Bytes that the tile lists may take, and with them, where a gradient may be asked for, the gradients of the Gaussians before
-    they are summed; more is refused with an error before it is allocated."""
+    """Most bytes for the tile lists, and, if gradients may be needed, for the gradients of each Gaussian in each tile. If a view
+    needs more, an error says so before anything is allocated."""
     tile_test: bool = True
     """Whether tiles of the bounding box that the ellipse misses are left out (`vlgs.skips`)."""
     block_masks: bool = True

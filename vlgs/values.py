@@ -1,4 +1,4 @@
-"""Whether a value of the configuration has the type that its constructor asks for, and is a number at all. Imports no torch."""
+"""Checks that values of the configuration have the types of the constructors' arguments, and that numbers are finite. Imports no torch."""
 
 import math
 import types

@@ -12,7 +12,7 @@ from vlgs.types import Camera
 
 SEED = torch.Generator().manual_seed(0)
 THRESHOLD = 0.995
-"""Above this |cosine| Eq. slerp is a lerp."""
+"""Above this |cosine| Eq. 9 is a lerp."""
 seeds = st.integers(0, 2**31)
 ratios = st.floats(0, 1)
 
@@ -104,7 +104,7 @@ def test_turns_about_an_axis_by_hand(degrees: float):
 
 
 def test_papers_formula_swaps_the_views_at_its_threshold():
-    """Half a degree more between the views, and the blended one jumps from one end to the other (S. D.1)."""
+    """Half a degree more between the views, and the blended one jumps from one end to the other (conf/README.md, D.1)."""
     for apart_by, from_view1 in ((11.0, 1.1), (12.0, 10.8)):
         q = slerp(z_rotation(0), z_rotation(apart_by), 0.9, "paper")
         angle = 2 * angle_between(q[None], z_rotation(0)[None])
@@ -112,7 +112,7 @@ def test_papers_formula_swaps_the_views_at_its_threshold():
 
 
 def test_papers_formula_by_hand_where_the_signs_differ():
-    """cos = -0.6: q1 is flipped but the angle is not, so that the blend is off its share (S. D.2)."""
+    """cos = -0.6: q1 is flipped but the angle is not, so that the blend is off its share (conf/README.md, D.2)."""
     q1, q2 = z_rotation(0), torch.tensor([-0.6, 0.0, 0.0, 0.8], dtype=torch.float64)
     theta = math.acos(-0.6)
     literal = -q1 * math.sin(0.75 * theta) + q2 * math.sin(0.25 * theta)

@@ -47,16 +47,16 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors": ("6006fdb8ea6bf531", "6ba5ebf0d129b31f", "3406056496cf84a0"),
+    "data.scene=mirrors": ("f6f83e32f15b45b4", "99d8cde4f4803be1", "bca9eee803a5ac58"),
     "levels=joint indicator=per_level fusion=none trainer=paper": (
-        "63977384b1e797df",
-        "29e77cb45afeaca7",
-        "3406056496cf84a0",
+        "17c0ba2aa7441e2a",
+        "7c33df2765de0765",
+        "bca9eee803a5ac58",
     ),
     "data=colmap data.root=here codec=identity sharing=pos protocol=lerf_ovs_v2": (
-        "781537d4e781aaf9",
-        "24b16d118edb3719",
-        "79cf48d6d96fcce7",
+        "cbf2231b856ab97f",
+        "11f318e48e5049a8",
+        "7fa5eb265910cece",
     ),
 }
 """Overrides -> run id for a content called f, recipe, data recipe. Where numbers change too, `RESULTS_VERSION` is raised and these are

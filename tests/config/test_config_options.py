@@ -61,6 +61,6 @@ def test_paper_trainer_is_the_papers():
     assert config.trainer.iterations == 15_000
     assert config.loss.blend_weight == 1.2
     rates = config.trainer.learning_rates
-    # tab:lr
+    # the paper's Table 7
     assert (rates.means, rates.log_scales, rates.quats, rates.sh0) == (1.6e-4, 5e-3, 1e-3, 5e-3)
     assert (rates.opacity_logits, rates.features, rates.indicator_logits) == (5e-2, 5e-3, 5e-2)

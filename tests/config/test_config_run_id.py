@@ -79,7 +79,10 @@ def test_a_part_of_ours_stands_where_it_belongs_only():
 
 
 def test_a_plugin_package_can_be_trusted():
-    check_targets(config(fusion={"_target_": "my_lab.Gated"}, plugins=["my_lab"]))
+    gated = {"_target_": "my_lab.Gated"}
+    check_targets(config(fusion=gated, plugins=["my_lab"]))
+    with pytest.raises(ValueError, match=r"fusion\._target_ must be one of vlgs\.fusion"):
+        check_targets(config(fusion=gated, plugins=["my_lab2"]))
 
 
 def test_a_trusted_name_that_leads_elsewhere_is_refused():

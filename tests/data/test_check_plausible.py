@@ -33,7 +33,7 @@ def test_maps_that_nobody_reads_are_named(tmp_path: Path):
 
 
 def test_all_faults_of_the_maps_are_told_together(tmp_path: Path):
-    """T11 and N20 of the pitfalls: missing, of another size, of another width, out of range, all -1."""
+    """Maps that are missing, of another size, of another width, out of range, all -1."""
     stems = write_scene(tmp_path)
     add_masks(tmp_path, stems)
     maps = tmp_path / "language_features"

@@ -146,7 +146,7 @@ def test_check_works_on_every_release(release: Path, option: str):
 
 
 def test_annotated_frames_of_lerf_ovs_under_the_llff_split():
-    # S. C.2: frames are numbered from 1 without gaps; of the annotated ones only these are held out.
+    # LangSplat's release: frames are numbered from 1 without gaps; of the annotated ones only these are held out.
     annotated = {
         "figurines": ((41, 105, 152, 195), [41, 105], 299),
         "ramen": ((6, 24, 60, 65, 81, 119, 128), [65, 81], 131),

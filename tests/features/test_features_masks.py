@@ -83,7 +83,7 @@ def test_box_nms_keeps_what_no_better_kept_box_overlaps(seed: int, count: int):
 
 
 def looped_nms(rule: MaskNms, masks: list[Mask], scores: np.ndarray) -> list[int]:
-    """The rule pair by pair, as systems.md A.2 has it; equal scores in order."""
+    """The rule of `MaskNms` pair by pair, without arrays; equal scores in order."""
     order = sorted(range(len(masks)), key=lambda i: (-scores[i], i))
     full = [whole(masks[i]) for i in order]
     n = len(order)

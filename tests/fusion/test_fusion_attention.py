@@ -13,7 +13,7 @@ from vlgs.fusion.attention import CrossAttention, SelfAttention, Token
 from vlgs.fusion.mlp import MLP
 
 READINGS = [(4, 1), (1, 4), (2, 3)]
-"""(width, heads): the default, the other reading of Eq. attention, and a mix of both."""
+"""(width, heads): the default, the other reading of Eq. 5, and a mix of both."""
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:

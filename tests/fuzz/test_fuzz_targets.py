@@ -32,5 +32,10 @@ def test_what_could_run_code_is_refused_before_it_does(arguments: tuple[str, ...
 
 
 @pytest.mark.parametrize("arguments", targets.HONEST[:7], ids=" ".join)
-def test_what_is_honest_is_taken(arguments: tuple[str, ...], strangers: Path):
+def test_what_is_honest_is_taken_unless_something_foreign_stands_beside_it(
+    arguments: tuple[str, ...], strangers: Path
+):
     check_command(arguments)
+    with pytest.raises(ValueError, match=r"query\._target_ must be one of vlgs\.query"):
+        check_command((*arguments, "query._target_=evil_lab.strike"))
+    assert not (strangers / targets.CANARY).exists()

@@ -67,13 +67,21 @@ def test_what_lies_behind_the_points_has_the_colour_that_views_see_there():
     cloud = background(toy, 500)
     assert len(cloud.points) == 500  # all around: what no view looks into as well
     distance = cloud.points.norm(dim=1)
-    assert distance.min() > 2 * 4
-    assert distance.min() > 9 * scene_extent(torch.stack([v.camera.viewmat for v in toy.train]))
     height = cloud.points[:, 2] / distance
+    extent = scene_extent(torch.stack([v.camera.viewmat for v in toy.train]))
+    assert distance[height > 0.2].min() > 9 * extent  # far, where there is nothing
+    torch.testing.assert_close(distance[height < -0.4], torch.full_like(distance[height < -0.4], 6))
     sky = cloud.colors[(height > 0.1) & (height < 0.4)]
     torch.testing.assert_close(sky, (torch.tensor(ABOVE) / 255).expand_as(sky))
     # The ground is seen before anything behind it: its colour is nowhere on the sphere.
     assert (cloud.colors - torch.tensor(BELOW) / 255).norm(dim=1).min() > 0.1
+
+
+def test_no_background_is_nearer_than_the_cameras_stand_apart():
+    toy = scene(shell(-5.0) / 40)  # a thing in the middle of a ring of cameras, 2 units from it
+    extent = scene_extent(torch.stack([v.camera.viewmat for v in toy.train]))
+    distance = background(toy, 500).points.norm(dim=1)
+    assert distance.min() >= 0.999 * extent
 
 
 def test_the_first_gaussians_stay_and_the_background_comes_after_them():

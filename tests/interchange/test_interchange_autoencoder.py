@@ -20,7 +20,7 @@ from vlgs.interchange import (
 
 
 class LangSplats(nn.Module):
-    """The network as S. A.2 and C.5 describe it, layer by layer."""
+    """LangSplat's network, layer by layer: linear, then batch norm, ReLU and linear; the decoder without batch norm."""
 
     def __init__(self, encoder=(256, 128, 64, 32, 3), decoder=(16, 32, 64, 128, 256, 256, 512)):
         super().__init__()

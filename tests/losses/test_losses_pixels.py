@@ -117,22 +117,6 @@ def test_weights_of_the_overall_loss():
     assert everywhere.blended_loss(feature, target, valid, 1.0).item() == 2.0
 
 
-def test_what_no_mask_claims_is_drawn_to_nothing_and_nothing_else_is():
-    feature = torch.zeros(2, 2, 3)
-    feature[..., 0] = torch.tensor([[0.01, 1.0], [0.01, 0.2]])
-    feature.requires_grad_()
-    absent = torch.tensor([[True, True], [False, True]])
-    loss = Losses(absent_weight=0.5).absent_loss(feature, absent)
-    loss.backward()
-    assert feature.grad is not None
-    assert (feature.grad != 0).any(dim=-1).tolist() == absent.tolist()
-    # A mean over all twelve numbers of half the square, where codes are short.
-    short, long, _, middle = feature.grad[..., 0].flatten().tolist()
-    assert short == pytest.approx(0.5 * 2 * 0.01 / 12, rel=1e-2)
-    # Of a code as long as masks make them little is taken back.
-    assert 0 < long < 0.3 * middle
-
-
 def test_options_choose_their_function():
     render, target = (x.detach().float() for x in maps())
     language = {

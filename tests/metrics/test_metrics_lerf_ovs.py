@@ -1,4 +1,4 @@
-"""LERF-OVS: hand-worked units, and an independent slow loop that follows systems.md B.1 step by step."""
+"""LERF-OVS: hand-worked units, and an independent slow loop that takes the steps of LangSplat's script one by one."""
 
 import numpy as np
 import pytest

@@ -129,7 +129,7 @@ def test_the_codes_of_a_level_learn_from_its_masks_alone(
 ):
     # Without fusion; with it, levels see each other as colour and language do.
     joint = join_levels(with_masks_at(scenes, level))
-    options = ("fusion=none", "loss.absent_weight=0.0", f"indicator={indicator}")
+    options = ("fusion=none", f"indicator={indicator}")
     module = stirred(module_of(joint, *options))
     module.training_step(0, 0)
     gradients = module.model.splats["features"].grad

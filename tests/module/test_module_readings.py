@@ -1,4 +1,4 @@
-"""Options for what the paper leaves open: each does what its name says (systems.md D)."""
+"""Options for what the paper leaves open (conf/README.md): each does what its name says."""
 
 from dataclasses import fields, replace
 

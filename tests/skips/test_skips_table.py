@@ -1,4 +1,4 @@
-"""The table of skips is what the configuration has and what README.md says."""
+"""The table of skips is what the configuration has and what conf/README.md says."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tiny_runs import composed
 from vlgs.config import instantiate
 from vlgs.skips import SKIPS, Skip, markdown_table, named, turn
 
-README = Path(__file__).parents[2] / "README.md"
+README = Path(__file__).parents[2] / "conf/README.md"
 SWITCHES = [skip for skip in SKIPS if skip.switchable]
 
 

@@ -245,9 +245,6 @@ CHECKS: dict[str, Callable[[], Check]] = {
         lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
     ),
     "vlgs.losses.Losses.language_loss": lambda: both(Losses(lang_loss="cos").language_loss, VALID),
-    "vlgs.losses.Losses.absent_loss": lambda: (
-        lambda feature: Losses().absent_loss(feature, ~VALID), [draw(*VALID.shape, 3)]
-    ),
     "vlgs.losses.Losses.blended_loss": lambda: both(Losses().blended_loss, VALID, 0.7),
     "vlgs.geometry.quat_to_rotmat": lambda: (quat_to_rotmat, [draw(4, 4)]),
     "vlgs.geometry.rotmat_to_quat": lambda: (rotmat_to_quat, [rotation]),

@@ -119,6 +119,11 @@ def test_a_table_is_read(tmp_path: Path):
         ("caption: words", "captoin: words", "must have caption"),
         ("dataset: lerf_ovs", "dataset: lerf_ovs\nbye: scene", "must have no key but .* got 'bye'"),
         ("label: tiny", "label: other", "label must be the file's name tiny, got other"),
+        (
+            "caption: words",
+            "caption: words\nnumber: four",
+            "number must be a whole number from 1, got 'four'",
+        ),
         ("[miou]", "[moiu]", "metrics must be of .*, got 'moiu'"),
         ("set: []", "set: fusion=none", "rows\\[0\\]: set must be a list"),
         ("set: []", "method: goi, set: []", "rows\\[0\\]: must have either set or method"),

@@ -52,7 +52,7 @@ SCENES = {
 """Scenes of a data set that its tables average over."""
 
 WAIT_SECONDS = 5.0
-"""Between two looks at runs that another process is computing."""
+"""Seconds between two looks at runs that another process is computing."""
 
 TRIES = 3
 """How often a run is planned again whose worker or process was killed."""
@@ -71,7 +71,7 @@ class Request:
 
 
 def main() -> None:
-    """Read the command line and do it."""
+    """Read the command line and run the ablation."""
     if len(sys.argv) == 1 or sys.argv[1] in ("-h", "--help"):
         print(__doc__)
         return
@@ -126,14 +126,14 @@ def read(arguments: Sequence[str]) -> Request:
 
 @dataclass
 class Tally:
-    """What is known about the runs beyond their results: it decides what is tried again."""
+    """Failures and interruptions of the runs so far; they decide which runs are tried again."""
 
     failed: dict[str, str] = field(default_factory=dict)
     """Name -> why, for runs that are not tried again."""
     lost: Counter[str] = field(default_factory=Counter)
 
     def add(self, run: PlannedRun, outcome: Outcome) -> None:
-        """Judge one outcome of a run that had no results before it; one that was never started has done nothing wrong."""
+        """Record the outcome of a run that had no results before. A run that was never started does not count as failed."""
         if outcome.busy or not outcome.log:
             return
         if outcome.lost:
@@ -240,7 +240,7 @@ def _missing(
 
 @contextmanager
 def stop_file(path: Path) -> Iterator[threading.Event]:
-    """Turn Ctrl-C, SIGTERM and a closed terminal into a file that all jobs look for, so that they save wherever they run.
+    """On Ctrl-C, SIGTERM or a closed terminal, create a file that tells all jobs, on any machine, to save and stop.
 
     A second signal interrupts at once.
     """

@@ -1,7 +1,7 @@
 """One run in a process of its own: what every launcher calls, on whichever machine it puts it.
 
-A job and whoever launched it talk through files of one folder, so that a worker on another machine needs nothing but the shared
-folder: the job writes how it goes (`<number>.json`), and ends early when a file named `stop` appears.
+Jobs and the ablation exchange files in one folder, so that a worker on another machine needs only access to that folder. A job
+writes its state to `<number>.json`, and stops early when a file named `stop` appears.
 """
 
 import json
@@ -40,7 +40,7 @@ class Outcome:
 
     @property
     def done(self) -> bool:
-        """Whether its results are there, if without the scores that were asked for."""
+        """Whether its results exist, with or without scores."""
         return self.status in (0, UNSCORED)
 
     @property
@@ -50,7 +50,7 @@ class Outcome:
 
     @property
     def lost(self) -> bool:
-        """Whether something outside the run ended it, so that trying again is worth while."""
+        """Whether something outside of the run ended it, so that it should be tried again."""
         return self.status is None or self.status < 0 or self.status == STOPPED
 
     def reason(self) -> str:
@@ -69,7 +69,7 @@ class Outcome:
 
 
 def read_outcome(folder: Path, number: int) -> Outcome:
-    """What the job of that number last said."""
+    """The last state that the job of that number wrote."""
     try:
         return Outcome(**json.loads(_record(folder, number).read_text()))
     except FileNotFoundError:
@@ -137,7 +137,7 @@ def _record(folder: Path, number: int) -> Path:
 
 
 def _title(overrides: Sequence[str]) -> str:
-    """Name of the log: the row, scene and seed, without places and what moves no number."""
+    """Name of the log: row, scene and seed, without paths and keys that move no number."""
     words = [o for o in overrides if not o.startswith(("results=", "hydra", "threads="))]
     name = "_".join(word.replace("data.", "").replace("/", "-") for word in words)
     safe = re.sub(r"[^\w=.,+@-]+", "_", name).encode()[-120:].decode(errors="ignore")

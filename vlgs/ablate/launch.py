@@ -1,4 +1,4 @@
-"""Hand the missing runs to the Hydra launcher that was chosen."""
+"""Start the missing runs through the chosen Hydra launcher."""
 
 import logging
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""How far an ablation is, while the launcher has the main thread: one line, read from what the jobs write."""
+"""The progress line of an ablation, read from the files that its jobs write. It runs in a thread, as the launcher uses the main one."""
 
 import threading
 from collections.abc import Iterator, Sequence
@@ -47,7 +47,7 @@ class Count:
 
 
 def duration(seconds: float) -> str:
-    """Seconds, minutes or hours, whichever reads best.
+    """A duration in seconds, minutes or hours.
 
     Example:
         >>> duration(42.0), duration(600.0), duration(9000.0)

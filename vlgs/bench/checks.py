@@ -1,4 +1,4 @@
-"""Promises of the rasterizer as figures that were measured, each against its bound."""
+"""What the rasterizer promises, measured: each error beside the bound that it must keep."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from vlgs.skips import Skip
 from vlgs.types import RasterConfig
 
 EXACT = 1e-6
-"""What an exact switch may move that adds in another order: image values absolutely, gradients relatively."""
+"""Largest change by an exact switch that changes the order of sums: of image values absolute, of gradients relative."""
 ROUNDING_IMAGE, ROUNDING_GRADIENT = 1e-5, 1e-3
 """float32 against float64 where nothing is cut off: image per largest value, gradients relative."""
 DENSE = 1e-10
@@ -51,7 +51,7 @@ def check_exact(scene: str, promise: str, errors: Errors, skip: Skip) -> Check:
 
 
 def check_presets(scene: str, w: Workload, presets: Mapping[str, RasterConfig]) -> list[Check]:
-    """Every preset stops early by no more than its threshold says: against the one before it that stops later, in float64."""
+    """The error of each preset's early stop against the previous preset, which stops later, in float64: within the bound of its threshold."""
     true = in_precision(w, torch.float64)
     outcomes = {name: outcome(true, config) for name, config in presets.items()}
     checks = []
@@ -89,5 +89,5 @@ def check_dense(presets: Mapping[str, RasterConfig], seed: int) -> list[Check]:
 
 
 def violated(checks: Sequence[Check]) -> list[Check]:
-    """Those that do not hold."""
+    """The promises that were not kept."""
     return [check for check in checks if not check.holds]

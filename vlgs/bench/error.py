@@ -57,7 +57,7 @@ class ErrorRow:
     backward: Spread
     repeats: int
     skipped: float | None
-    """Of a switch: share of the work that is left out where it is on, whatever this row has it (`skipped_share`)."""
+    """Share of the work that the switch leaves out when it is on, also in the row where it is off (`skipped_share`)."""
     memory: Memory
     error: Errors
     quality: Quality

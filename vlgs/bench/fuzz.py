@@ -1,4 +1,4 @@
-"""Random hostile scenes through the rasterizer and back: finite numbers or a named error, nothing else (pitfalls N2).
+"""Random hostile scenes through the rasterizer and back: finite numbers or a named error, nothing else (tests/README.md, N2).
 
 With each scene go random calls of the other kernels (`vlgs.bench.fuzz_layers`). A scene is a function of its seed alone, so that
 `python -m vlgs.bench fuzz --first SEED --scenes 1` runs a failure again. Refusing a tame scene is a failure too.

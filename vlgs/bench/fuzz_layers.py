@@ -20,9 +20,9 @@ from vlgs.types import Camera, RasterConfig
 
 ROWS = (0, 1, 2, 15, 16, 17, 40)
 LONG = (2047, 2048, 2049, 4100)
-"""Around the chunks that one thread takes."""
+"""Lengths around those of the chunks that one thread takes."""
 SIDES = (1, 2, 10, 11, 12, 15, 16, 17, 33)
-"""Around the window and the lanes."""
+"""Sides around those of the window and of the lanes."""
 CHUNK = 1 << 14
 """Numbers that one thread takes of squared errors; 16 such chunks are worth another thread."""
 
@@ -152,7 +152,7 @@ def _squared_error(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
 
 
 def _agree(name: str, got: Tensor, want: Tensor, in_range: Tensor, relative: float) -> None:
-    """Where the truth, in float64, is within the range of the type it is what came out, to rounding; elsewhere nothing finite but it is.
+    """Require that a result equals the truth (float64) up to rounding where its type can hold it, and is not finite elsewhere.
 
     Not a number is one on both sides; what the type cannot hold may be infinite instead.
     """

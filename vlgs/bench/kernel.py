@@ -23,8 +23,7 @@ ISAS = ("v4", "v3", "base")
 """Instruction sets of the kernel, best first: AVX-512, AVX2, baseline."""
 
 SETTLE_SECONDS = 0.05
-"""Between two turns: OpenMP's threads of the process before go on spinning for a while, on a core that the next one needs. One pass
-that does not count follows, because its own have gone to sleep."""
+"""Pause between two turns, because OpenMP's threads of the previous process keep spinning for a while on cores that the next one needs. One pass that does not count follows, to wake its own threads."""
 REFERENCE_BYTES = 80
 """Memory of the dense reference and its gradients per Gaussian, pixel and pair of groups, bytes: an estimate, not measured."""
 

@@ -1,4 +1,4 @@
-"""How much of an unseen view is covered by Gaussians that hardly any training view sees."""
+"""The share of an unseen view that is drawn by Gaussians which hardly any training view sees."""
 
 import torch
 from jaxtyping import Float

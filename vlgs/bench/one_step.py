@@ -1,4 +1,4 @@
-"""One training step with a switch of `vlgs.skips` turned, which can be taken again and again: it ends before Adam."""
+"""One training step with a switch of `vlgs.skips` on or off. It ends before Adam, so that it can be repeated from the same state."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -1,4 +1,4 @@
-"""What a rasterizer made of a scene, images and gradients, and how far that is from the truth."""
+"""Images and gradients that a rasterizer computed, and their errors against the truth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

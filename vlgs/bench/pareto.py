@@ -1,4 +1,4 @@
-"""Run time against error: which ways to render nothing else beats in both."""
+"""The Pareto front of run time and error: settings for which no other is both faster and more exact."""
 
 from collections.abc import Sequence
 from pathlib import Path

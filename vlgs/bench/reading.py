@@ -1,4 +1,4 @@
-"""From the command to the first training step on many large photographs: time and peak memory, stage by stage."""
+"""Time and peak memory of each stage before the first training step, with many large photographs."""
 
 import os
 import tempfile

@@ -1,7 +1,7 @@
-"""The switches of `vlgs.skips` that a training step has: the step with the work left out against the step with it done.
+"""Time and error of each skip of `vlgs.skips` that acts in a training step: one step with the skip, one without.
 
-Both steps start from one state of one module, look at the same views and end before Adam, so that they can be taken again and
-again. Where a switch decides step by step, those steps are timed in which it takes effect, and of them the worst.
+Both steps use the same module, parameters and views, and stop before Adam changes anything, so that they can be repeated. Some
+skips act in some steps only: then those of such steps are timed in which most is lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,13 +35,13 @@ class StepRow:
     switch: str
     kind: str
     default: str
-    """What a run does that says nothing: ``on`` or ``off``."""
+    """``on`` or ``off``: the skip's state where a run does not set its key."""
     threads: int
     steps: int
-    """That were taken in turn."""
+    """Number of steps that were timed."""
     on_forward: Spread
     on_backward: Spread
-    """With what looks through the gradients."""
+    """Includes the check that all gradients are finite."""
     off_forward: Spread
     off_backward: Spread
     repeats: int

@@ -1,4 +1,4 @@
-"""Quality where nobody stood: views between, beyond and above the training views, few views, skies and plain walls."""
+"""Quality of views that were never photographed: between, beyond and above the training views, under a sky, before a plain wall."""
 
 import tempfile
 import time

@@ -1,4 +1,4 @@
-"""Camera-view blending: a third camera between two real ones, and the language map it should see (Eqs. slerp, lerp, blend)."""
+"""Camera-view blending: a third camera between two real ones, and the language map it should see (Eqs. 9 to 11)."""
 
 from vlgs.blend.pose import blend_camera, blend_cameras, slerp
 from vlgs.blend.ratio import BetaBlend, FixedBlend, GaussianBlend, NoBlend, UniformBlend, ViewBlend

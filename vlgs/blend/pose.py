@@ -1,4 +1,4 @@
-"""The camera between two cameras (Eqs. slerp and lerp, with their errors set right; S. D.1-D.5)."""
+"""The camera between two cameras (Eqs. 9 and 10 with their errors set right; conf/README.md, D.1 to D.5)."""
 
 import math
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ def slerp(
     """Unit quaternions on the short arc between two rotations; k = 1 is rotation 1, k = 0 rotation 2.
 
     ``consistent`` turns at constant speed, by ``1 - k`` of the angle from rotation 1, whatever the signs of the inputs.
-    Eq. slerp changes to a normalised lerp above ``|cos| = 0.995`` "for efficiency"; the weights here are those of its
+    Eq. 9 changes to a normalised lerp above ``|cos| = 0.995`` "for efficiency"; the weights here are those of its
     slerp branch, set right, in a form that is lerp in the limit. They need no branch, are continuous, and differ from that
-    lerp by at most 1.6e-5 rad of quaternion angle. ``paper`` is Eq. slerp to the letter, for ablation: k swaps its
+    lerp by at most 1.6e-5 rad of quaternion angle. ``paper`` is Eq. 9 to the letter, for ablation: k swaps its
     meaning between the branches, theta is not that of the flipped pair, and only ``0/0`` at ``cos = 0`` is settled (as +1).
 
     Args:

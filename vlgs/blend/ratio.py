@@ -20,21 +20,21 @@ class ViewBlend(ABC):
     """
 
     rotation: bool = True
-    """Off: the rotation of view 1 is kept (S. D.12); see `kept`."""
+    """Off: the rotation of view 1 is kept (conf/README.md, D.12); see `kept`."""
     translation: bool = True
     """Off: the centre of view 1 is kept; see `kept`."""
     ssim: bool = True
     """Off: the loss is not weighted by the similarity of the two photographs."""
     convention: Convention = "consistent"
-    """``paper``: Eq. slerp to the letter, whose slerp branch gives k to view 2 (S. D.1, D.2)."""
+    """``paper``: Eq. 9 to the letter, whose slerp branch gives k to view 2 (conf/README.md, D.1 and D.2)."""
     mask: Literal["and", "or"] = "and"
     """Which pixels of the mixed language map count: those where both views have a code, or where either has."""
     renormalise: bool = False
-    """Whether mixed codes get back the length that mixing takes from them."""
+    """Whether mixed codes, which are shorter than the originals, are stretched to the original length."""
     kept: Literal["first", "nearer"] = "first"
-    """Whose rotation or centre stays where one of them is not blended: that of view 1, or of the view whose weight is larger (S. D.12)."""
+    """Which view's rotation (or centre) is kept if it is not blended: that of view 1, or of the view with the larger weight (conf/README.md, D.12)."""
     pairs: Literal["uniform", "neighbours"] = "uniform"
-    """Whether the second view of an iteration is any other, or one of the nearest (S. D.13)."""
+    """Whether the second view of an iteration is any other, or one of the nearest (conf/README.md, D.13)."""
     neighbours: int = 4
     """How many are near, for ``pairs=neighbours``."""
 
@@ -59,7 +59,7 @@ class ViewBlend(ABC):
 
 @dataclass(frozen=True)
 class BetaBlend(ViewBlend):
-    """k ~ Beta(alpha, alpha), the paper's choice; a small alpha stays near the real views (tab:value).
+    """k ~ Beta(alpha, alpha), the paper's choice; a small alpha stays near the real views (Table 16).
 
     Example:
         >>> 0 <= BetaBlend(alpha=0.2).draw(np.random.default_rng(0)) <= 1
@@ -80,7 +80,7 @@ class BetaBlend(ViewBlend):
 
 @dataclass(frozen=True)
 class UniformBlend(ViewBlend):
-    """k ~ U(0, 1), the "even distribution" of tab:ab-multi C."""
+    """k ~ U(0, 1), the "even distribution" of Table 4 C."""
 
     def draw(self, rng: np.random.Generator) -> float:
         """Return k in [0, 1)."""
@@ -89,7 +89,7 @@ class UniformBlend(ViewBlend):
 
 @dataclass(frozen=True)
 class GaussianBlend(ViewBlend):
-    """k ~ N(mean, std^2), the "Gaussian distribution" of tab:ab-multi C, whose N(0, 1) mostly leaves [0, 1] (S. D.14)."""
+    """k ~ N(mean, std^2), the "Gaussian distribution" of Table 4 C, whose N(0, 1) mostly leaves [0, 1] (conf/README.md, D.14)."""
 
     mean: float = 0.0
     std: float = 1.0
@@ -120,7 +120,7 @@ class GaussianBlend(ViewBlend):
 
 @dataclass(frozen=True)
 class FixedBlend(ViewBlend):
-    """The same k for every pair (the "fixed to" rows of tab:ab-multi C)."""
+    """The same k for every pair (the "fixed to" rows of Table 4 C)."""
 
     value: float = 0.5
 
@@ -136,7 +136,7 @@ class FixedBlend(ViewBlend):
 
 @dataclass(frozen=True)
 class NoBlend(ViewBlend):
-    """No blended view, hence no L_b (the row without any check mark of tab:ab-cam)."""
+    """No blended view, hence no L_b (the row without any check mark of Table 5)."""
 
     rotation: bool = field(default=False, init=False)
     translation: bool = field(default=False, init=False)

@@ -1,4 +1,4 @@
-"""The language map that the blended view should see (Eq. blend)."""
+"""The language map that the blended view should see (Eq. 11)."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,7 +18,7 @@ def blend_targets(
     """Mix two language maps pixel by pixel without warping: ``H_b = k H1 + (1 - k) H2``, and say which pixels have a code.
 
     With ``mask="or"`` a pixel that only one view has a code for takes that code. The mix of two unit codes is shorter than
-    1; ``renormalise`` stretches it to ``k |H1| + (1 - k) |H2|``, which is 1 for unit codes (S. D.5).
+    1; ``renormalise`` stretches it to ``k |H1| + (1 - k) |H2|``, which is 1 for unit codes (conf/README.md, D.5).
 
     Args:
         codes1: Language codes of view 1; what stands at pixels that are not valid is not used.

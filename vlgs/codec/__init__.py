@@ -8,7 +8,7 @@ from torch import Tensor
 
 @runtime_checkable
 class Codec(Protocol):
-    """The whole contract. Implementations are modules, so that what they learn is in the checkpoint."""
+    """The interface of a codec. Implementations are modules, so that checkpoints contain what they learned."""
 
     dim: int
     """Width d of the codes."""

@@ -1,4 +1,4 @@
-"""LangSplat's autoencoder of one scene's embeddings, trained in seconds (systems.md A.2, stage 1; C.5)."""
+"""LangSplat's autoencoder of one scene's embeddings, trained in seconds (Qin et al., CVPR 2024)."""
 
 import hashlib
 import json
@@ -23,14 +23,12 @@ log = logging.getLogger(__name__)
 
 FORMAT = "vlgs-autoencoder-3"
 """Part of the cache key: a change of the code that moves the weights changes it."""
-EMPTY_CODES, EMPTY_LENGTH = 32, 0.15
-"""Codes that `AutoencoderTraining.empty` looks at in a step, and the length of the longest: well under `min_coverage`."""
 CHECKS = 5
 """Times that the reconstruction is measured over the last fifth of the steps; the best weights stay."""
 WIDEST = 8192
 """Two layers of this width take half a gigabyte."""
 MEASURED = 8192
-"""Most embeddings that a measurement looks at, evenly spaced among the sorted ones: of 81 000 it would cost more than the fit."""
+"""Most embeddings that a measurement uses, evenly spaced among the sorted ones. Measuring all of 81 000 would take longer than the fit."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +47,12 @@ class AutoencoderTraining:
     things apart, because a rendered code is never quite the one that was learnt."""
     min_coverage: float = 0.5
     """Codes are shortened by a factor drawn from this to 1, as rendering does where the weights do not add up to 1."""
-    empty: float = 0.0
-    """Weight of what codes near zero decode to, in the loss: to the opposite of the mean embedding, which is farther from every word than
-    anything seen is. It is what a pixel answers that no language covers. 0, the default, leaves it to chance, as LangSplat does:
-    few numbers tell words apart a little less well with it. 0.01 goes with `loss.absent_weight`."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         require_range("autoencoder", 2, 10**7, steps=self.steps)
         require_range("autoencoder", 2, 2**20, batch=self.batch)
         require_range("autoencoder", 0, 10, area_power=self.area_power, code_noise=self.code_noise)
-        require_range("autoencoder", 0, 10, empty=self.empty)
         require_range("autoencoder", 0, 2**63 - 1, seed=self.seed)
         if not 0.0 < self.learning_rate <= 1.0:
             raise ValueError(
@@ -75,7 +68,7 @@ DEFAULT_TRAINING = AutoencoderTraining()
 
 
 class Autoencoder(nn.Module):
-    """A few numbers per Gaussian in place of an embedding of hundreds (systems.md A.2, stage 1).
+    """A few numbers per Gaussian in place of an embedding of hundreds.
 
     Encoder and decoder have LangSplat's layers, names and unit outputs. The loss is one minus the cosine of each
     embedding and its reconstruction. LangSplat's MSE + 0.001 (1 - cos) is a multiple of it between unit vectors, which
@@ -198,9 +191,6 @@ class Autoencoder(nn.Module):
             self.build(vectors.shape[1])
         if self.center:
             self.mean = areas @ vectors / areas.sum()
-        # One embedding alone has nothing to be told apart from.
-        apart = settings.empty > 0 and len(vectors) > 1
-        common = normalize(areas @ vectors / areas.sum(), dim=0) if apart else None
         optimizer = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
@@ -210,7 +200,7 @@ class Autoencoder(nn.Module):
         best: tuple[float, dict[str, Tensor]] = (-torch.inf, {})
         for step, batch in enumerate(rows.split(settings.batch), start=1):
             optimizer.zero_grad()
-            self._loss(vectors[batch], common, step / settings.steps, generator).backward()
+            self._loss(vectors[batch], step / settings.steps, generator).backward()
             optimizer.step()
             schedule.step()
             if step in _checked_steps(settings.steps):
@@ -223,11 +213,10 @@ class Autoencoder(nn.Module):
     def _loss(
         self,
         vectors: Float[Tensor, "m e"],
-        common: Float[Tensor, " e"] | None,
         progress: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """Mean of 1 - cos over a batch whose codes are disturbed as rendering disturbs them, and what no code at all decodes to."""
+        """Mean of 1 - cos over a batch whose codes are disturbed as rendering disturbs them."""
         settings = self.fit_settings
         self.encoder.train()
         codes = self.encode(vectors)
@@ -235,12 +224,7 @@ class Autoencoder(nn.Module):
         noise = torch.randn(codes.shape, generator=generator)
         shortening = torch.rand(len(codes), 1, generator=generator) * (1 - settings.min_coverage)
         codes = (codes + progress * settings.code_noise * noise) * (1 - progress * shortening)
-        error = 1 - (self.decode(codes) * vectors).sum(dim=-1).mean()
-        if common is None:
-            return error
-        near_zero = EMPTY_LENGTH * normalize(noise[:EMPTY_CODES], dim=-1)
-        near_zero = near_zero * torch.linspace(0, 1, len(near_zero))[:, None]
-        return error + settings.empty * (self.decode(near_zero) @ common).mean()
+        return 1 - (self.decode(codes) * vectors).sum(dim=-1).mean()
 
     @torch.no_grad()
     def _measure(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> float:
@@ -315,7 +299,7 @@ def _distinct(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Matrices this small gain nothing from a second thread, lose much where cores are shared, and differ in bits."""
+    """Run on one thread: matrices this small gain nothing from a second one, are slower on shared cores, and their last bits depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""A store of decoded pixels with a ceiling, least recently used first out."""
+"""A cache of decoded pixels with a limit in bytes; what was used least recently is dropped first."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable

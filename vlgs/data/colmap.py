@@ -47,10 +47,10 @@ from vlgs.values import require_fields
 log = logging.getLogger(__name__)
 
 _FEW_VIEWS = 6
-"""Fewer training views than this are doubted."""
+"""Fewer training views than this give a warning."""
 
 _MOST_WARNINGS = 8
-"""That a run says; `vlgs.check` lists all."""
+"""Warnings that a run prints at most; `vlgs.check` lists all."""
 
 _VERSION = "vlgs.data.colmap 1"
 """Part of the fingerprint: to be raised when the same files lead to other pixels."""
@@ -91,7 +91,7 @@ class ColmapSource:
     cache_bytes: int = 1 << 26
     """Memory for decoded pixels: those of all views are kept, or none, and always the tables of undistortion."""
     release: Mapping[str, Any] = field(default_factory=dict)
-    """What the paths of a data set's configuration are put together from; `name` says what is looked for."""
+    """Settings of a data set's release, from which its paths are made; `name` is the name of the data set in errors."""
 
     def __post_init__(self) -> None:
         require_fields("data", self)
@@ -119,7 +119,7 @@ class ColmapSource:
 
 @dataclass(frozen=True)
 class Survey:
-    """A scene's files, looked at: what is wrong with them, and what can be read all the same."""
+    """The result of looking at a scene's files: what is wrong with them, and what can still be read."""
 
     faults: tuple[Fault, ...]
     model: SparseModel | None = None
@@ -142,7 +142,7 @@ class _Parts:
 
 
 def load_scene(root: str, **options: Any) -> Scene:
-    """Read a COLMAP scene (S. C.1, C.2, C.4); the `_target_` of ``conf/data/colmap.yaml``.
+    """Read a COLMAP scene; the `_target_` of ``conf/data/colmap.yaml``.
 
     Pixels stay on disk until a view's readers are called. Views are in order of image name.
 
@@ -164,7 +164,7 @@ def load_scene(root: str, **options: Any) -> Scene:
 
 @cache
 def _say_warnings(warnings: tuple[str, ...]) -> None:
-    """Say them once in a process, however often it reads the scene."""
+    """Log the warnings, once per process."""
     for line in warnings[:_MOST_WARNINGS]:
         log.warning("warning: %s", line)
     if len(warnings) > _MOST_WARNINGS:
@@ -388,7 +388,7 @@ def _classes(
 
 
 def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
-    """Hash of what was read, as far as it can move a number; where it was read from does not count."""
+    """Hash of all content that can move a number; folders do not count."""
     hasher = hashlib.blake2b(digest_size=16)
     options = (source.resize, source.level, source.rule, parts.model.cameras)
     hasher.update(repr((_VERSION, options)).encode())

@@ -44,19 +44,19 @@ class FaultList(list[Fault]):
     """Everything found so far."""
 
     def take(self, result: tuple[T, Iterable[Fault]]) -> T:
-        """The first half of what a reader returned; the second, its faults, is added."""
+        """Return the first value of a reader's result, and add the second, its faults, to the list."""
         value, found = result
         self.extend(found)
         return value
 
 
 def warning(file: object, what: str, advice: str = "", where: str = "") -> Fault:
-    """A fault that a scene can be loaded with."""
+    """Make a fault that does not keep the scene from being loaded."""
     return Fault(str(file), what, advice, where, "warning")
 
 
 def errors(faults: Iterable[Fault]) -> tuple[Fault, ...]:
-    """Those of the faults that keep a scene from being loaded."""
+    """The faults that keep a scene from being loaded."""
     return tuple(fault for fault in faults if fault.severity == "error")
 
 

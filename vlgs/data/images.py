@@ -18,7 +18,7 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}
 _ORIENTATION = 0x0112
 
 _DECODED = 4
-"""Photographs that are looked at for transparent pixels."""
+"""Number of photographs that are searched for transparent pixels."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Photograph:
 
 
 def open_photograph(path: Path, camera_size: tuple[int, int]) -> Photograph:
-    """Read the header of an image and hold its size against that of its camera.
+    """Read the header of an image and compare its size with that of its camera.
 
     COLMAP ignores the EXIF orientation, so pixels are taken as stored wherever they fit the camera; the orientation is
     applied only where nothing else fits, which is how a camera made by another tool is told apart.

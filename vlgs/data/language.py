@@ -1,4 +1,4 @@
-"""Language supervision in LangSplat's layout: mask ids per pixel, a vector per mask, and a vocabulary (S. C.4).
+"""Language supervision in LangSplat's layout: mask ids per pixel, a vector per mask, and a vocabulary.
 
 ``<stem>_s.npy`` [4, H, W] holds for each mask level (0 default, 1 subpart, 2 part, 3 whole) the mask that a pixel lies in, -1
 for none; ids run on from level to level. ``<stem>_f.npy`` [M, e] holds one unit vector per id.

@@ -54,7 +54,7 @@ class Lens:
         return np.array([[fx / sx, 0, cx / sx], [0, fy / sy, cy / sy], [0, 0, 1]])
 
     def to_file(self, xy: Float64[np.ndarray, "p 2"]) -> Float64[np.ndarray, "p 2"]:
-        """Positions in the file of positions in the output, both in pixels; NaN where the lens has no image of them."""
+        """Map positions in the output to positions in the file, both in pixels; NaN where the lens sees nothing."""
         xy = xy * self._scale()
         if self.distorted is None:
             return xy
@@ -205,7 +205,7 @@ def _scaled_pinhole(camera: SparseCamera, file_size: tuple[int, int]) -> SparseC
 
 
 def _require_invertible(lens: Lens, camera: SparseCamera, source: str) -> None:
-    """Refuse parameters that fold the image or blow it up: along the border and in the middle, back must undo forth."""
+    """Refuse distortion that cannot be inverted: at the border and in the middle, undistorting must undo distorting."""
     xy = np.concatenate([_border(lens.size, margin=0.5), np.divide(lens.size, 2)[None]])
     returned = lens.from_file(lens.to_file(xy))
     if np.abs(returned - xy).max() < 0.5:  # False for NaN

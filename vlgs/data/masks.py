@@ -96,7 +96,7 @@ def missing_faults(
 
 
 def stray_faults(folder: Path, stems: Collection[str]) -> Iterator[Fault]:
-    """Files that would silently not be read: halves of a pair, and maps of no photograph.
+    """Warnings about files that would not be read: one file of a pair without the other, and maps without a photograph.
 
     Args:
         folder: Of language maps.
@@ -153,7 +153,7 @@ def _read_view(source: ViewSource) -> ViewMasks:
 
 
 def _stack(read: Sequence[ViewMasks]) -> MaskTable:
-    """Number the vectors of all views through."""
+    """Join the vectors of all views in one table."""
     sources, first = {}, 0
     for masks in read:
         rows = np.full(masks.n_vectors + 1, -1, np.int32)

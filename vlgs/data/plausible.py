@@ -1,4 +1,4 @@
-"""What a sound scene may still have against it: doubts that `vlgs.check` lists and `vlgs.run` logs, never errors."""
+"""Warnings about scenes that can be used but are probably not as intended. `vlgs.check` lists them, `vlgs.run` logs them."""
 
 from collections.abc import Iterator, Sequence
 
@@ -26,7 +26,7 @@ _FOCAL = (0.02, 500.0)
 
 
 def plausibility_warnings(scene: Scene, views: Sequence[View]) -> Iterator[Fault]:
-    """Cameras, points, scale of the world, labels that are not tested, categories that are one word spelled twice."""
+    """Warnings about cameras, points, the scale of the world, labels that no test view has, and classes that differ in spelling only."""
     yield from _camera_warnings(views)
     yield from _point_warnings(scene)
     yield from _scale_warnings(scene, views)

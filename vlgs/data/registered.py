@@ -1,4 +1,4 @@
-"""The registered images of a reconstruction, joined with their files."""
+"""Images that a reconstruction has a camera pose for, each matched with its file."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

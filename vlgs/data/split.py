@@ -14,7 +14,7 @@ class Split:
     """A rule that tells training views from test views.
 
     ``llff``: every `every`-th view in order of name is held out, from the first on. ``holdout``: the labelled views are.
-    ``all``: every view trains and the labelled ones are tested as well, as LangSplat does it (S. D.22). ``list``: the views
+    ``all``: every view trains and the labelled ones are tested as well, as LangSplat does it (conf/README.md, D.22). ``list``: the views
     of `test` are held out.
     """
 
@@ -35,7 +35,7 @@ class Split:
 
     @property
     def name(self) -> str:
-        """As it stands in the name of a protocol."""
+        """The rule's name, which becomes part of the protocol's name."""
         return f"llff{self.every}" if self.kind == "llff" else self.kind
 
     def divide(

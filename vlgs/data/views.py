@@ -1,4 +1,4 @@
-"""One view's files behind the readers of `vlgs.types.View`: decoded when asked, warped by one lens, kept within a limit."""
+"""The files of one view: read when needed, undistorted, and cached. They stand behind the read functions of `vlgs.types.View`."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -142,7 +142,7 @@ class ViewSource:
         return torch.from_numpy(self.warp(self.labels.read_ids(self.name), fill=IGNORE_ID))
 
     def _require_size(self, pixels: Tensor) -> None:
-        """The file may have been replaced since its header was read."""
+        """Raise an error if the size has changed since the header was read: the file was replaced."""
         got = (pixels.shape[1], pixels.shape[0])
         if got != self.lens.file_size:
             what = f"size must still be {self.lens.file_size}, got {got}"
@@ -171,8 +171,8 @@ class _Masks(Mapping[str, Bool[Tensor, "h w"]]):
 def map_sizes(lens: Lens, camera_size: tuple[int, int]) -> list[tuple[int, int]]:
     """Sizes that a mask or label map of a view may have, in the geometry of its image file (not undistorted).
 
-    It was made from the image file, or from the full-size original of a scaled copy, or from either after LangSplat's rule
-    that no image is higher than 1080 pixels (S. A.2). Another size would have to be guessed at.
+    It was made from the image file, or from the full-size original of a scaled copy, or from either after the rule of
+    LangSplat's preprocessing that no image is higher than 1080 pixels. Another size would have to be guessed at.
     """
     sizes = [lens.file_size, camera_size]
     for width, height in (lens.file_size, camera_size):

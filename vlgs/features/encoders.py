@@ -18,7 +18,7 @@ from vlgs.features.weights import Pretrained
 class ImageEncoder:
     """One vector per mask from a pretrained image encoder: CLIP, SigLIP, DINOv2 or what else transformers loads.
 
-    As LangSplat does it (S. A.2): pixels outside of the mask black, cut to its box, padded to a square with black, scaled to the
+    As LangSplat's preprocessing does it: pixels outside of the mask black, cut to its box, padded to a square with black, scaled to the
     model's input. Models with ``get_image_features`` (CLIP, SigLIP) give what they compare with text, others (DINOv2)
     their pooled output.
 

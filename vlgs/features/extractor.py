@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int32, UInt8
 from vlgs.features.masks import Mask, paint
 
 LEVELS = 4
-"""0 default, 1 subpart, 2 part, 3 whole (S. C.4)."""
+"""0 default, 1 subpart, 2 part, 3 whole: the order of LangSplat's maps."""
 
 
 _WITHOUT_WEIGHTS = "(features/segmenter=superpixels and features/encoder=maps need no weights)"

@@ -1,4 +1,4 @@
-"""The work of `python -m vlgs.features`: which photographs, what is done already, one after the other."""
+"""The work of `python -m vlgs.features`: finds the photographs that have no language maps yet, and makes these one by one."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -174,7 +174,7 @@ def estimate(job: Job) -> Iterator[str]:
 
 
 def map_size(view: ViewSource, max_height: int | None) -> tuple[int, int]:
-    """Height and width of a photograph's maps; LangSplat's rule for the width (S. A.2)."""
+    """Height and width of a photograph's maps; LangSplat's rule for the width: it is cut, not rounded."""
     width, height = view.photograph.width, view.photograph.height
     if max_height is None or height <= max_height:
         return height, width

@@ -1,4 +1,4 @@
-"""Masks kept as the pixels of their boxes, so that a thousand of them take megabytes, and what is done to them."""
+"""Masks that store only the pixels of their bounding box (a thousand of them take megabytes), and operations on them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

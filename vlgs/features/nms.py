@@ -1,4 +1,4 @@
-"""Non-maximum suppression: of boxes as SAM does it, of masks as LangSplat does it (S. A.2)."""
+"""Non-maximum suppression: of boxes as SAM does it, of masks as LangSplat does it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""SAM's automatic masks (Kirillov et al., ICCV 2023), its three outputs kept apart as LangSplat does (S. A.2).
+"""SAM's automatic masks (Kirillov et al., ICCV 2023), its three outputs kept apart as LangSplat does.
 
 Points of a grid are put to the model one by one, on the photograph and on overlapping crops of it. Of the three masks that
 each point gives, those pass whose predicted IoU and stability are high and which do not end at the border of a crop; box NMS

@@ -1,4 +1,4 @@
-"""Weights of pretrained models: where they lie on this machine, whose bytes they are, and what to do if they are missing."""
+"""Weights of pretrained models: where they are on this machine, a digest of their content, and an error that says what to do if they are missing."""
 
 import hashlib
 from dataclasses import dataclass

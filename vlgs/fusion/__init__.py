@@ -8,7 +8,7 @@ from torch import Tensor
 
 @runtime_checkable
 class Fusion(Protocol):
-    """The whole contract: row i of the result depends on row i of the input only, in training and at test time alike."""
+    """The interface of a fusion: row i of the result depends on row i of the input only, in training and at test time alike."""
 
     def __call__(
         self, color: Float[Tensor, "n dc"], feature: Float[Tensor, "n df"]

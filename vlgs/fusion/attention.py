@@ -26,9 +26,9 @@ class Token(NamedTuple):
 class SelfAttention(nn.Module):
     """Let the channels of one Gaussian attend to each other before rasterising.
 
-    With x = c (+) f and every channel a token of width h (Eq. attention): ``u = x + out(softmax(Q K^T / sqrt(h)) V)``.
+    With x = c (+) f and every channel a token of width h (Eq. 5): ``u = x + out(softmax(Q K^T / sqrt(h)) V)``.
     Gaussians never attend to each other, so that the cost is linear in n. The paper calls h "the number of heads", but
-    it stands where the width of a key belongs; ``width=1, heads=4`` is the other reading (S. D.6), with as many weights.
+    it stands where the width of a key belongs; ``width=1, heads=4`` is the other reading (conf/README.md, D.6), with as many weights.
 
     Args:
         color_dim: Channels of colour d_c.
@@ -79,8 +79,8 @@ class SelfAttention(nn.Module):
 class CrossAttention(nn.Module):
     """Let the language channels of one Gaussian attend to its colour channels; colour stays as it is.
 
-    ``u_f = f + out(softmax(Q(f) K(c)^T / sqrt(h)) V(c))`` and ``u_c = c`` (the cross-attention row of tab:ab-multi, appendix
-    sec:lr, S. D.6). Arguments, errors and start are those of `SelfAttention`.
+    ``u_f = f + out(softmax(Q(f) K(c)^T / sqrt(h)) V(c))`` and ``u_c = c`` (the cross-attention row of Table 4;
+    appendix A.1; conf/README.md, D.6). Arguments, errors and start are those of `SelfAttention`.
 
     Example:
         >>> color = torch.rand(10, 3)

@@ -9,10 +9,10 @@ from vlgs.fusion.blocks import from_blocks, linear, to_blocks
 
 
 class MLP(nn.Module):
-    """Mix the channels of one Gaussian by a single linear layer (the MLP row of tab:ab-multi).
+    """Mix the channels of one Gaussian by a single linear layer (the MLP row of Table 4).
 
     With x = c (+) f: ``u = x + Linear(x)``, or ``u = Linear(x)`` without the residual; the paper does not say which
-    (S. D.6). The residual layer starts at zero, so that training starts from `NoFusion`; the plain one at Xavier's
+    (conf/README.md, D.6). The residual layer starts at zero, so that training starts from `NoFusion`; the plain one at Xavier's
     uniform weights.
 
     Args:

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 
 class NoFusion(nn.Module):
-    """Return colour and language code as they are: ``u = c (+) f`` (the "no fusion" row of tab:ab-multi, S. D.26)."""
+    """Return colour and language code as they are: ``u = c (+) f`` (the "no fusion" row of Table 4)."""
 
     def forward(
         self, color: Float[Tensor, "n dc"], feature: Float[Tensor, "n df"]

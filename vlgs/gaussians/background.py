@@ -1,8 +1,11 @@
-"""Far Gaussians behind everything, so that no ray ends in nothing.
+"""Gaussians behind everything, so that no ray ends in nothing.
 
-Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training explains such pixels
-by what it has: large, faint ones close to the cameras, which fit every training view and fog all others. And where no training view
-looked, an unseen view would look through the scene into black.
+Structure from motion finds no points on skies and plain walls. Without Gaussians behind everything, training fits such pixels with
+large, faint Gaussians close to the cameras. These fit every training view and appear as fog in all others. And an unseen view
+that looks where no training view looked would show black.
+
+Where there are points the background stands not far behind them. Training makes what is in front of it half transparent, and
+corrects the colour with what shines through; the farther behind that is, the less the two fit together from another place.
 """
 
 import math
@@ -14,24 +17,27 @@ from torch.nn.functional import max_pool2d
 
 from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.init import Cloud, parameters_of
-from vlgs.gaussians.neighbors import mean_squared_distance
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
 
 CELLS = (4, 16)
-"""A view is looked through in squares, so many across its longer side: half the square root of the points in it, within these."""
+"""Smallest and largest number of squares across the longer side of a view; the number is half the square root of the points in it."""
 CAMERA_SHARE, POINT_SHARE = 10.0, 2.0
-"""Radius of the sphere: the larger of so many scene extents and so many times the distance within which 19 of 20 points lie."""
+"""Far is the larger of so many scene extents and so many times the distance within which 19 of 20 points lie."""
+BEHIND, CONE, FEWEST = 1.5, 0.2, 3
+"""In a direction with at least `FEWEST` points within `CONE` radians, the background is `BEHIND` times as far as 19 of 20 of them."""
 MAX_VIEWS = 64
 """Views that are looked through, evenly chosen."""
 MAX_POINTS = 1 << 17
 """Points that are looked for in a view, evenly chosen."""
+MAX_NEAR = 1 << 14
+"""Points that are looked for in a direction, evenly chosen."""
 
 
 def with_background(
     parameters: dict[str, Tensor], scene: Scene, config: GaussiansConfig
 ) -> dict[str, Tensor]:
-    """The first Gaussians and, behind them, round ones on a sphere around cameras and scene.
+    """The first Gaussians and, behind them, round ones all around cameras and scene.
 
     A scene without sparse points gets none: its random ones are everywhere already.
 
@@ -43,13 +49,15 @@ def with_background(
     sphere = background(scene, config.background)
     if len(sphere.points) == 0:
         return parameters
-    scales = mean_squared_distance(sphere.points).sqrt()
+    middle, _ = _middle(scene)
+    # The distance of neighbours on a sphere of this many directions.
+    scales = (sphere.points - middle).norm(dim=1) * math.sqrt(4 * math.pi / config.background)
     behind = parameters_of(sphere, scales, config, parameters["features"].shape[1])
     return {name: torch.cat([value, behind[name]]) for name, value in parameters.items()}
 
 
 def background(scene: Scene, count: int) -> Cloud:
-    """Evenly spread points of the sphere and the colours that training views have there.
+    """Points behind the scene in evenly spread directions from the middle of the cameras, and the colours that training views have there.
 
     A direction has the mean colour of the views that look past every sparse point there, if most that look into it do. Other
     directions have the colour of the nearest such one: what hides the sky in them is not the colour of the sky. Where there is none at
@@ -60,11 +68,11 @@ def background(scene: Scene, count: int) -> Cloud:
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
     if count == 0 or len(points) == 0:
         return Cloud(points[:0], points[:0])
-    viewmats = torch.stack([view.camera.viewmat for view in scene.train]).float()
-    middle = camera_center(viewmats).mean(dim=0)
+    middle, extent = _middle(scene)
     within = (points - middle).norm(dim=1).quantile(0.95).item()
-    radius = max(CAMERA_SHARE * scene_extent(viewmats), POINT_SHARE * within)
-    sphere = middle + radius * _directions(count)
+    far = max(CAMERA_SHARE * extent, POINT_SHARE * within)
+    directions = _directions(count)
+    sphere = middle + far * directions
     seen, past = torch.zeros(count), torch.zeros(count)
     total, sky = torch.zeros(count, 3), torch.zeros(count, 3)
     for view in scene.train[:: -(-len(scene.train) // MAX_VIEWS)]:
@@ -78,10 +86,32 @@ def background(scene: Scene, count: int) -> Cloud:
     if not seen.any():  # cameras that see nothing of the sphere: of a huge focal length, or a principal point far out
         return Cloud(points[:0], points[:0])
     known = 2 * past > seen
+    reach = _reach(points - middle, directions).clamp(extent, far).masked_fill(known, far)
     if not known.any():
         known, past, sky = seen > 0, seen, total
     nearest = torch.cdist(sphere, sphere[known]).argmin(dim=1)
-    return Cloud(sphere, (sky[known] / past[known][:, None])[nearest])
+    colors = (sky[known] / past[known][:, None])[nearest]
+    return Cloud(middle + reach[:, None] * directions, colors)
+
+
+def _middle(scene: Scene) -> tuple[Float[Tensor, "3"], float]:
+    """Mean of the camera centres, and the scene extent: no camera is farther from it."""
+    viewmats = torch.stack([view.camera.viewmat for view in scene.train]).float()
+    return camera_center(viewmats).mean(dim=0), scene_extent(viewmats)
+
+
+def _reach(
+    points: Float[Tensor, "n 3"], directions: Float[Tensor, "count 3"]
+) -> Float[Tensor, " count"]:
+    """Distance from the origin to the background behind the points, infinite in directions without points."""
+    points = points[:: -(-len(points) // MAX_NEAR)]
+    distances = points.norm(dim=1)
+    reach = torch.full((len(directions),), torch.inf)
+    for number, direction in enumerate(directions):
+        ahead = distances[points @ direction > math.cos(CONE) * distances]
+        if len(ahead) >= FEWEST:
+            reach[number] = BEHIND * ahead.quantile(0.95)
+    return reach
 
 
 def _directions(count: int) -> Float[Tensor, "count 3"]:

@@ -8,7 +8,7 @@ from vlgs.values import require_range
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """Adaptive density control (3DGS; systems.md A.1, D.10, D.11). Steps count from 0."""
+    """Adaptive density control of 3DGS (Kerbl et al. 2023; conf/README.md, D.10 and D.11). Steps count from 0."""
 
     start: int = 500
     """No densification up to and including this step."""
@@ -61,22 +61,25 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class GaussiansConfig:
-    """What the Gaussians of a scene carry and how they start."""
+    """Which values each Gaussian has, and how they start."""
 
     color: Literal["rgb_dc", "rgb", "evaluated"] = "rgb_dc"
-    """Colour that is fused with language (systems.md D.7): the RGB of degree 0, to which the other degrees are added after fusion; RGB
+    """Colour that is fused with language (conf/README.md, D.7): the RGB of degree 0, to which the other degrees are added after fusion; RGB
     without harmonics; or all degrees as the view sees them, with which language depends on the view too."""
     sh_degree: int = 3
     """Highest spherical harmonics degree that is stored, 0 to 3; see `degree`."""
     init_opacity: float = 0.1
     init_indicator: float = 0.1
-    """The paper starts the indicator in the same manner as the opacity (systems.md A.11)."""
+    """The paper starts the indicator in the same manner as the opacity (its section 4.1)."""
     init_features: Literal["zero", "lifted"] = "zero"
-    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (systems.md D.9, F.4)."""
+    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (`vlgs.module.lift`; conf/README.md, D.9)."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
-    """Directions all around in which a far Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
+    """Directions all around in which a Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
+    silent_above: float = 0.7
+    """Share of a Gaussian's language weight outside of masks, over the training views, above which its code is zero in the end
+    (`vlgs.module.silence`); 1: none is."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -84,11 +87,11 @@ class GaussiansConfig:
     """Sparse points beyond this are left out, and densification stops growing here."""
     prune_on: Literal["max", "opacity", "indicator"] = "max"
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
-    reading of the paper (systems.md D.10); ``indicator`` is for Gaussians of language alone."""
+    reading of the paper (conf/README.md, D.10); ``indicator`` is for Gaussians of language alone."""
     init: str | None = None
     """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
-    """Loss whose screen gradients feed densification (systems.md D.11)."""
+    """Loss whose screen gradients feed densification (conf/README.md, D.11)."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
 
     def __post_init__(self) -> None:
@@ -103,6 +106,7 @@ class GaussiansConfig:
         require_range("gaussians", 1, 10**7, init_points=self.init_points)
         require_range("gaussians", 1, 10**9, max_count=self.max_count)
         require_range("gaussians", 0, 10**6, background=self.background)
+        require_range("gaussians", 0, 1, silent_above=self.silent_above)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),

@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, prune and reset (3DGS; systems.md A.1, D.10, D.11)."""
+"""Adaptive density control: clone, split, prune and reset (Kerbl et al. 2023; conf/README.md, D.10 and D.11)."""
 
 import logging
 import math
@@ -47,7 +47,7 @@ class DensifyState:
         width: int,
         height: int,
     ) -> None:
-        """Add one real view; gradients of several views are never summed before their length is taken (D.11).
+        """Add one real view; gradients of several views are never summed before their length is taken (conf/README.md, D.11).
 
         Args:
             mean2d_grad: Gradient of the loss with respect to `Rendered.mean2d`, per pixel.
@@ -150,7 +150,7 @@ def reset_opacity(
 ) -> None:
     """Lower every opacity to `reset_to` at most and forget its Adam moments, in place.
 
-    Indicators stay as they are unless `reset_indicator` (systems.md D.10).
+    Indicators stay as they are unless `reset_indicator` (conf/README.md, D.10).
     """
     names = ["opacity_logits"]
     if config.densify.reset_indicator:
@@ -163,7 +163,7 @@ def reset_opacity(
 
 
 def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
-    """Gaussians that no image would miss, and those that are not Gaussians at all."""
+    """Gaussians that are too faint to matter, and those with broken parameters."""
     indicator, opacity = params["indicator_logits"].sigmoid(), params["opacity_logits"].sigmoid()
     if indicator.dim() == 2:  # one level that needs a Gaussian keeps it
         indicator = indicator.amax(dim=1)
@@ -187,7 +187,7 @@ def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n
 def _spare(
     doomed: Bool[Tensor, " n"], merit: Float[Tensor, " n"], finite: Bool[Tensor, " n"] | None = None
 ) -> Bool[Tensor, " n"]:
-    """Take the best of the doomed back where fewer than `MIN_COUNT` would be left."""
+    """Keep the best of those to be pruned if fewer than `MIN_COUNT` would be left."""
     able = torch.ones_like(doomed) if finite is None else finite
     alive = int((able & ~doomed).sum())
     floor = min(MIN_COUNT, int(able.sum()))

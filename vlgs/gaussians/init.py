@@ -40,7 +40,7 @@ class Cloud:
 def initialise(
     scene: Scene, config: GaussiansConfig, feature_dim: int, seed: int = 0
 ) -> dict[str, Tensor]:
-    """Raw parameters of the first Gaussians (3DGS; systems.md A.1), keyed by `PARAMETERS`.
+    """Raw parameters of the first Gaussians (as in 3DGS), keyed by `PARAMETERS`.
 
     Each sparse point becomes an isotropic Gaussian whose variance is the mean squared distance to its three nearest
     neighbours, clamped at 1e-7 below and by `GaussiansConfig.max_init_angle` above. Non-finite points, points on a
@@ -50,7 +50,7 @@ def initialise(
     Args:
         scene: With at least one training view.
         config: What the Gaussians carry.
-        feature_dim: Width d of the language code, which starts at zero here (systems.md D.9).
+        feature_dim: Width d of the language code, which starts at zero here (conf/README.md, D.9).
         seed: Decides the random points, and which ones are kept when there are more than `max_count`.
 
     Raises:

@@ -24,7 +24,7 @@ opacity_logits [n], indicator_logits [n] ([n, levels] with ``indicator=per_level
 Gaussian i."""
 
 LANGUAGE_SHAPE = ("language_quats", "language_log_scales")
-"""Keys that are there only where language has covariances of its own (``sharing=pos``): [n, 4] and [n, 3]."""
+"""Keys of the second covariance, for language, which exist with ``sharing=pos`` only: [n, 4] and [n, 3]."""
 
 
 def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Gaussians as a 3DGS ``point_cloud.ply`` (systems.md C.6), with language codes and indicators appended.
+"""Gaussians as a ``point_cloud.ply`` of 3DGS, with language codes and indicators appended.
 
 Three dialects differ in what follows the rotation: ours ``lang_0`` ... and ``indicator``, Feature-3DGS ``semantic_0`` ...,
 3DGS nothing. Whatever is there is read.
@@ -106,7 +106,7 @@ def read_ply(path: str | Path, feature_dim: int = 3) -> dict[str, Tensor]:
 
 
 def read_notes(path: str | Path) -> tuple[str, ...]:
-    """What a file says of itself: the notes of `write_ply`; empty where the first is not `PLAIN`."""
+    """The notes that `write_ply` put into a file; empty if the first is not `PLAIN`."""
     with Path(path).open("rb") as file:
         header, _, _ = file.read(_NOTES_END).partition(b"end_header")
     lines = header.decode("ascii", errors="replace").split("\n")
@@ -116,7 +116,7 @@ def read_notes(path: str | Path) -> tuple[str, ...]:
 
 
 def parse_ply(path: str | Path) -> dict[str, Tensor]:
-    """What a file holds of `vlgs.gaussians.PARAMETERS`, not yet judged: `features` and `indicator_logits` may be missing.
+    """The `vlgs.gaussians.PARAMETERS` of a file, not yet checked; `features` and `indicator_logits` may be missing.
 
     Raises:
         FileNotFoundError: If there is no such file.

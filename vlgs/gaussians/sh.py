@@ -30,7 +30,7 @@ def view_color(
     eye: Float[Tensor, " 3"],
     degree: int,
 ) -> Float[Tensor, "n 3"]:
-    """Colour seen from a point: `color` plus the sum over degrees 1 to `degree`, clamped at 0 (``colour=rgb_dc``, systems.md D.7).
+    """Colour seen from a point: `color` plus the sum over degrees 1 to `degree`, clamped at 0 (``gaussians.color=rgb_dc``).
 
     As in 3DGS the direction reaches the gradient of `means`: the colour of a Gaussian depends on where it is seen from.
 

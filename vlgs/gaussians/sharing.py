@@ -1,4 +1,4 @@
-"""What colour and language have in common (tab:ab-seperate; systems.md D.16). Mirrored by conf/sharing."""
+"""What colour and language have in common (Table 17; conf/README.md, D.16). Mirrored by conf/sharing."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ class Sharing:
     """
 
     means: bool = True
-    """Off: two sets of Gaussians, each trained by the losses of its modality alone."""
+    """Off: two sets of Gaussians, one for colour and one for language, each trained by its own losses."""
     covariances: bool = True
     """Off: a second rotation and scale per Gaussian, with which language is blended."""
     lifted: bool = False
-    """On: language is not trained, but lifted onto what colour alone has learned (systems.md F.4)."""
+    """On: language is not trained, but lifted onto what colour alone has learned (`vlgs.module.lift`)."""
 
     def __post_init__(self) -> None:
         if self.covariances and not self.means:

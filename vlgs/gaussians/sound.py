@@ -1,4 +1,4 @@
-"""Rows of raw parameters that no renderer can use: counted, and refused or dropped."""
+"""Finds Gaussians whose parameters no renderer can use (not finite, or a quaternion of zero), to refuse or to drop them."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Which weight per Gaussian blends language: l in Eq. lancity, or what an ablation puts in its place (S. D.10, D.15)."""
+"""Which weight per Gaussian blends language: l in Eq. 6, or what an ablation puts in its place (conf/README.md, D.10 and D.15)."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -12,7 +12,7 @@ from vlgs.types import Gaussians
 
 @runtime_checkable
 class Indicator(Protocol):
-    """The whole contract."""
+    """The interface of an indicator."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
         """Return the weight in [0, 1] with which each Gaussian's language code is blended; one per level where they differ."""
@@ -21,7 +21,7 @@ class Indicator(Protocol):
 
 @dataclass(frozen=True)
 class Learned:
-    """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. lancity)."""
+    """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. 6)."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
         """Return `gaussians.indicators` itself."""
@@ -30,7 +30,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class PerLevel:
-    """A learned indicator of its own for every mask level (``levels=joint``; systems.md D.8)."""
+    """A learned indicator of its own for every mask level (``levels=joint``)."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
         """Return `gaussians.indicators` itself: [n] where a model has no levels (the colour of ``sharing=none``)."""
@@ -39,10 +39,10 @@ class PerLevel:
 
 @dataclass(frozen=True)
 class ColourOpacity:
-    """Language blended with the colour opacity, as earlier systems do (Eq. lang_render)."""
+    """Language blended with the colour opacity, as earlier systems do (Eq. 2)."""
 
     detach: bool = False
-    """Whether the language loss is kept from moving the opacity; the paper lets it (S. D.15)."""
+    """Whether the language loss is kept from moving the opacity; the paper lets it (conf/README.md, D.15)."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
         """Return `gaussians.opacities` itself, so that the rasteriser runs one transmittance chain for both modalities."""
@@ -51,7 +51,7 @@ class ColourOpacity:
 
 @dataclass(frozen=True)
 class Fixed:
-    """One constant for every Gaussian, not learned (the "fixed to" rows of tab:ab-multi B).
+    """One constant for every Gaussian, not learned (the "fixed to" rows of Table 4 B).
 
     Raises:
         ValueError: If the value is outside [0, 1].

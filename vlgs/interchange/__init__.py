@@ -1,6 +1,6 @@
-"""What other systems write, in and out: Gaussians, checkpoints, autoencoders, language maps, cameras.
+"""Reads and writes the files of other systems: Gaussians, checkpoints, autoencoders, language maps, cameras.
 
-Nothing here runs code from a file: pickles are read by torch's own restricted reader, which knows tensors and plain values.
+Nothing here runs code from a file: pickles are read by torch's restricted reader, which accepts only tensors and plain values.
 """
 
 from vlgs.interchange.autoencoder import load_weights, read_autoencoder, write_autoencoder

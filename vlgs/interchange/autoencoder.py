@@ -1,4 +1,4 @@
-"""LangSplat's autoencoder weights (systems.md C.5) as our codec, and back."""
+"""LangSplat's autoencoder weights (``best_ckpt.pth``) as our codec, and back."""
 
 from collections.abc import Mapping
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""3DGS's and LangSplat's ``chkpnt<iteration>.pth`` (systems.md C.7): a tuple of 12 or 13 values, and the iteration.
+"""3DGS's and LangSplat's ``chkpnt<iteration>.pth``: a tuple of 12 or 13 values, and the iteration.
 
 LangSplat's 13 are 3DGS's 12 with ``language_feature`` [n, 3] after the opacity; the length tells which. The raw values are kept:
 LangSplat renders ``f / (|f| + 1e-9)``.

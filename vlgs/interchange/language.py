@@ -1,4 +1,4 @@
-"""LangSplat's ``language_features`` -> ``language_features_dim3``: the codes of an autoencoder in place of the embeddings (C.4)."""
+"""LangSplat's ``language_features`` -> ``language_features_dim3``: the codes of an autoencoder in place of the embeddings."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A run that starts from Gaussians that exist (``gaussians.init``)."""
+"""Starts a run from the Gaussians of a file (``gaussians.init``)."""
 
 import hashlib
 import logging

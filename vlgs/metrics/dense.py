@@ -1,7 +1,7 @@
 """Scores of a class map against a class for every pixel.
 
-The prediction of a pixel is the class with the largest cosine, which is also the largest under the paper's vocabulary softmax
-at any temperature (systems.md B.7); with several mask levels the largest cosine of any level counts. Pixels are counted over all
+The prediction of a pixel is the class with the largest cosine, which is also the largest under the paper's softmax over the
+vocabulary (Eq. 4) at any temperature; with several mask levels the largest cosine of any level counts. Pixels are counted over all
 held-out views together, and a class's IoU comes from these counts. (torchmetrics' MeanIoU averages per image instead.)
 
 mIoU is the mean over the classes that occur in truth or prediction: a class that the scene does not show, predicted on one stray

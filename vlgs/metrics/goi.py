@@ -1,4 +1,4 @@
-"""Mip-NeRF 360 as GOI evaluates it: masks per prompt, means over images of a prompt, then over prompts (systems.md B.4).
+"""Mip-NeRF 360 as GOI evaluates it: masks per prompt, means over images of a prompt, then over prompts.
 
 GAGS, LangSplatV2 and LEGO use other labels on the same photographs; that is `mipnerf360_gags`, and the two do not share a column.
 """

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of a rendered view against its photograph, both on [0, 1] and over the pixels the photograph covers (B.5)."""
+"""PSNR and SSIM of a rendered view against its photograph, both on [0, 1] and over the pixels the photograph covers."""
 
 import math
 from typing import Literal
@@ -41,7 +41,7 @@ def ssim(
 ) -> float | None:
     """Structural similarity in [-1, 1], 11x11 Gaussian window of sigma 1.5; None without a valid pixel.
 
-    Computed in float64, where E[x^2] - E[x]^2 of a flat image stays clean (pitfalls.md N15).
+    Computed in float64, where E[x^2] - E[x]^2 of a flat image stays clean (tests/README.md, N15).
 
     Args:
         image: What was rendered.
@@ -88,4 +88,4 @@ def _ssim_zero_padded(a: Float[Tensor, "1 c h w"], b: Float[Tensor, "1 c h w"]) 
 
 
 NO_LPIPS = "LPIPS needs a pretrained AlexNet or VGG from torchvision (also in torchmetrics, lpips and piq), which is not a dependency"
-"""Why `lpips` is not available in any result."""
+"""The reason in every result why `lpips` is missing."""

@@ -1,4 +1,6 @@
-"""The LERF-OVS protocol as LangSplat released it: segmentation and localisation of one prompt in one view (systems.md B.1).
+"""The LERF-OVS protocol as LangSplat released it: segmentation and localisation of one prompt in one view.
+
+The source is ``eval/evaluate_iou_loc.py`` of minghanqin/LangSplat; `vlgs.metrics.segment` and `vlgs.metrics.smooth` hold its steps.
 
 A query is one category in one labelled view. Its relevancy comes at one or several mask levels; segmentation and localisation
 choose a level each, by the largest smoothed value, without looking at the labels. Scene figures are means over queries, not over
@@ -30,7 +32,7 @@ class LerfOvs:
 
     Args:
         constants: Its numbers.
-        strict: Score localisation by the first maximum only, and never a constant map (pitfalls.md finding 8).
+        strict: Score localisation by the first maximum only, and never a constant map.
     """
 
     constants: Constants = LANGSPLAT

@@ -1,4 +1,4 @@
-"""What one prompt selects in one view, counted against the truth: the record that every protocol adds up."""
+"""Compares what one prompt selects in one view with the truth; every protocol averages these records."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

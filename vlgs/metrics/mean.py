@@ -1,4 +1,4 @@
-"""The one rule for sets that may be empty."""
+"""The mean of a set that may be empty; all scores use it."""
 
 from collections.abc import Iterable
 

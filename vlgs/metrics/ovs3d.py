@@ -1,4 +1,4 @@
-"""3D-OVS, where the published evaluations differ so much that each is a protocol of its own (systems.md B.3, B.4).
+"""3D-OVS, where the published evaluations differ so much that each is a protocol of its own.
 
 A query is one class in one labelled view; only classes with a mask in that view are asked for. None of these defines
 localisation, so there is none.

@@ -1,4 +1,4 @@
-"""What a protocol is: a name, a version, a score for every query, and the rule that makes figures of the scores."""
+"""The interface of a protocol: a name, a version, a score for every query, and how the scores become figures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -55,7 +55,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Figures:
-    """What a protocol says about a scene. None is not available, and `reasons` says why."""
+    """Figures of a scene by one protocol. None means not available; `reasons` says why."""
 
     miou: float | None
     loc_acc: float | None
@@ -67,11 +67,11 @@ class Figures:
 
 @runtime_checkable
 class EvaluationProtocol(Protocol):
-    """The whole contract. Implementations are frozen dataclasses whose fields are the protocol's numbers."""
+    """The interface of a protocol. Implementations are frozen dataclasses whose fields are the protocol's numbers."""
 
     @property
     def name(self) -> str:
-        """As it stands in results and tables."""
+        """The name in results and tables."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""From a relevancy map to a mask: the steps that LangSplat and its successors share, each with its published numbers."""
+"""From a relevancy map to a mask, in the steps that LangSplat and its successors share, with the published constants of each."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +12,7 @@ from vlgs.values import require_range
 
 @dataclass(frozen=True)
 class Constants:
-    """The numbers of a segmentation; LangSplat's released code is the default (systems.md B.1, B.2).
+    """The numbers of a segmentation; ``eval/evaluate_iou_loc.py`` of LangSplat is the default.
 
     Raises:
         ValueError: If a number is out of its range.

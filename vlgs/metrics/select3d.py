@@ -1,4 +1,4 @@
-"""Direct selection in 3D, as OpenGaussian and its successors score it (systems.md B.2).
+"""Direct selection in 3D, as OpenGaussian (Wu et al., NeurIPS 2024) and its successors score it.
 
 Gaussians are selected by their own relevancy, the selected ones alone are rendered, and the silhouette is compared with the
 mask. Not comparable with protocols that compare pixels: LangSplat drops from 51.4 to 9.7 on LERF-OVS by this change alone.

@@ -1,4 +1,4 @@
-"""Windows that slide over a map: the means and votes of the published evaluation codes, borders included."""
+"""Sliding means and votes over a map, with the windows and the treatment of borders of the published evaluation codes."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -7,7 +7,7 @@ from torch.nn.functional import pad
 
 
 def box_mean(maps: Float[Tensor, "b h w"], size: int) -> Float[Tensor, "b h w"]:
-    """Mean over a square window, as OpenCV's ``filter2D`` with its default anchor and border (systems.md B.1).
+    """Mean over a square window, as OpenCV's ``filter2D`` with its default anchor and border.
 
     The window of an even size s reaches from -s/2 to s/2 - 1; the border mirrors without repeating the edge. Summed areas in
     float64 make the cost independent of the size; rounding back to the input's precision restores the ties of equal windows.
@@ -20,7 +20,7 @@ def box_mean(maps: Float[Tensor, "b h w"], size: int) -> Float[Tensor, "b h w"]:
 
 
 def pool_mean(maps: Float[Tensor, "b h w"], size: int) -> Float[Tensor, "b h w"]:
-    """Mean over a centred square window of odd size; cells beyond the border do not count (LangSplatV2, systems.md B.2)."""
+    """Mean over a centred square window of odd size; cells beyond the border do not count (LangSplatV2)."""
     return (_window_sum(maps.double(), size) / _window_area(maps, size)).to(maps.dtype)
 
 
@@ -40,7 +40,7 @@ def majority_vote(mask: Bool[Tensor, "h w"], size: int) -> Bool[Tensor, "h w"]:
 
 
 def pool_vote(mask: Bool[Tensor, "h w"], size: int) -> Bool[Tensor, "h w"]:
-    """Majority over a centred square window of odd size, ties to False; every pixel votes (LangSplatV2, systems.md B.2)."""
+    """Majority over a centred square window of odd size, ties to False; every pixel votes (LangSplatV2)."""
     votes = _window_sum(mask.to(torch.int32)[None], size)[0]
     return 2 * votes > _window_area(votes[None], size)
 

@@ -1,4 +1,4 @@
-"""Further training views, rendered once from a first model of colour: the offline augmentation of tab:ov-cmp (systems.md D.17)."""
+"""Further training views, rendered once from a first model of colour: the offline augmentation of Table 13 (conf/README.md, D.17)."""
 
 import io
 from collections.abc import Mapping, Sequence

@@ -18,10 +18,10 @@ class BlendPlan:
     k: float
     similarity: float
     weight: float
-    """lambda * SSIM(I1, I2) of Eq. blend."""
+    """lambda * SSIM(I1, I2) of Eq. 11."""
     camera: Camera
     reuse: int | None
-    """0 or 1 where that real view's language stands for the blended view's (`trainer.skip.blend_reuse`)."""
+    """Index (0 or 1) of the real view that is used in place of the blended one (`trainer.skip.blend_reuse`)."""
 
 
 def plan_blend(

@@ -1,4 +1,4 @@
-"""From a scene and the chosen parts to a module that is ready to train."""
+"""Builds a module that is ready to train from a scene and the chosen parts."""
 
 import logging
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Parts:
-    """The points chosen on the axes; one field per configuration group."""
+    """The chosen parts of a run; one field per configuration group."""
 
     gaussians: GaussiansConfig
     sharing: Sharing

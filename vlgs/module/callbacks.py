@@ -1,4 +1,4 @@
-"""What happens around an iteration: densification, checkpoints, the progress bar, log.csv, a graceful stop."""
+"""Callbacks of training: densification, checkpoints, the progress bar, log.csv, and stopping on Ctrl-C."""
 
 import math
 import os
@@ -17,12 +17,13 @@ from vlgs.gaussians import densify, reset_opacity
 from vlgs.module.checkpoint import save_checkpoint
 from vlgs.module.curves import COLUMNS, csv_lines, read_rows
 from vlgs.module.lightning import VLGSModule
+from vlgs.module.silence import silence
 from vlgs.module.state import capture
 from vlgs.runs import RunFolder, stop_signals
 
 
 class Densification(L.Callback):
-    """Clone, split, prune and reset, from the two real views of each iteration (systems.md A.1, D.10, D.11)."""
+    """Clone, split, prune and reset, from the two real views of each iteration (conf/README.md, D.10 and D.11)."""
 
     def on_train_batch_end(
         self,
@@ -58,6 +59,25 @@ class Densification(L.Callback):
             reset_opacity(module.model.splats, module.optimizer, config)
 
 
+class Silence(L.Callback):
+    """After the last iteration, take the codes of what lies outside of masks (`vlgs.module.silence`)."""
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Do so when it is time."""
+        module = _own(pl_module)
+        share, features = module.gaussians_config.silent_above, module.model.splats["features"]
+        done = module.next_step == module.settings.iterations
+        if done and share < 1 and module.has_language and features.requires_grad:
+            silence(module, share)
+
+
 class OwnFolder(L.Callback):
     """End a run whose folder was deleted or replaced, before anything more is written."""
 
@@ -72,7 +92,7 @@ class OwnFolder(L.Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Look."""
+        """Check that the folder is still the same."""
         self.folder.require_own()
 
 
@@ -86,7 +106,7 @@ class Checkpoints(L.Callback):
         self.saved: int | None = None
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """What is resumed from is saved already."""
+        """Note that the resumed step is saved already."""
         self.saved = _own(pl_module).next_step
 
     def on_train_batch_end(
@@ -141,7 +161,7 @@ class CurveLog(L.Callback):
         self.every = every
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Keep the rows up to the step that is resumed from; later ones will come again."""
+        """Keep the rows up to the resumed step; later ones will be written again."""
         step, rows = _own(pl_module).next_step, []
         if self.path.is_file() and step > 0:
             rows = [row for row in read_rows(self.path) if int(row[0]) <= step]
@@ -298,7 +318,7 @@ class GracefulStop(L.Callback):
 
 
 def _leave_closed_terminal(terminals: list[int]) -> None:
-    """Let what would be printed on a terminal that is no more go nowhere; it must not end what is being saved."""
+    """Discard output to a closed terminal, so that an error of writing does not interrupt saving."""
     for descriptor in terminals:
         if not os.isatty(descriptor):
             nowhere = os.open(os.devnull, os.O_WRONLY)

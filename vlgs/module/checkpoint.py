@@ -1,8 +1,7 @@
-"""Checkpoints: one safetensors file each, which is whole and verified, or is not taken.
+"""Checkpoints: one safetensors file each. A file that is incomplete or damaged is never used.
 
-A file is written under a temporary name and renamed, and the digest of all that it holds stands in its header, so that one rename
-makes a checkpoint complete. The two newest are kept: where the newer one is damaged, the older one is taken. Nothing is ever
-unpickled.
+A file is written under a temporary name and then renamed; its header has a digest of the content. The two newest files are kept,
+and if the newer one is damaged the older one is used. Nothing is ever unpickled.
 """
 
 import hashlib
@@ -24,7 +23,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = "vlgs-checkpoint-2"
 FIRST_FORMAT = "vlgs-checkpoint-1"
-"""Its digest, of the whole file, stands in ``latest.json`` beside it."""
+"""Format of the first checkpoints, whose digest is in ``latest.json`` beside them."""
 KEPT = 2
 _NAME = re.compile(r"step_(\d+)\.safetensors")
 
@@ -40,7 +39,7 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint; of those before it the newest stays.
+    """Write a checkpoint, and keep only the newest of the earlier ones.
 
     Raises:
         OSError: If the disk is full or read-only; the previous checkpoint is then untouched.

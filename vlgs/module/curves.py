@@ -1,4 +1,4 @@
-"""log.csv: its columns, and what can still be read of one that was cut short, edited or damaged."""
+"""The columns of log.csv, and a reader that keeps the intact lines of a damaged file."""
 
 import csv
 import io
@@ -19,7 +19,7 @@ def csv_lines(rows: Sequence[Sequence[object]]) -> str:
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """The rows that can be read, as no number depends on this file; a warning counts the others.
+    """The intact rows; a warning counts the others. No result depends on this file.
 
     Columns are found by name, and by place where no header names them.
     """

@@ -1,4 +1,4 @@
-"""Train a module to the end of its budget, or to the first Ctrl-C, from wherever its last checkpoint left it."""
+"""Trains a module from its last checkpoint to the end of its budget, or to the first Ctrl-C."""
 
 import logging
 import warnings
@@ -17,6 +17,7 @@ from vlgs.module.callbacks import (
     GracefulStop,
     OwnFolder,
     ProgressLine,
+    Silence,
     TrainingClock,
 )
 from vlgs.module.checkpoint import keep_from, load_checkpoint
@@ -30,7 +31,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What surrounds training but cannot move a number."""
+    """Options of training that cannot move a number."""
 
     meta: dict[str, Any]
     """JSON values that go into every checkpoint, e.g. the configuration."""
@@ -78,6 +79,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
         OwnFolder(folder),  # before whatever writes
         StuckAlarm(module.settings.log_every),
         Densification(),
+        Silence(),
         TrainingClock(),  # ends an iteration after its densification
         CurveLog(folder.curves, module.settings.log_every),
         Checkpoints(folder.checkpoint, module.settings.checkpoint_every, options.meta),
@@ -92,7 +94,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
 
 
 def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions) -> L.Trainer:
-    """A Trainer that adds nothing of its own to a step: checkpoints, curves and the bar are callbacks of ours."""
+    """A Trainer with our own callbacks for checkpoints, curves and progress, and none of Lightning's."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     return L.Trainer(
@@ -109,7 +111,7 @@ def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions
 
 @contextmanager
 def _expected_warnings() -> Iterator[None]:
-    """Two warnings of Lightning that are no news here."""
+    """Silence two warnings of Lightning that are expected here."""
     with warnings.catch_warnings():
         # The codec is fitted before training starts; its BatchNorm must keep the statistics it has.
         warnings.filterwarnings("ignore", message="Found .* module.* in eval mode")

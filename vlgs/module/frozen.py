@@ -1,4 +1,4 @@
-"""Training on geometry that does not move: what is constant about a view is computed once."""
+"""Training with frozen geometry: everything about a view that stays constant is computed once."""
 
 from collections.abc import Hashable
 
@@ -16,7 +16,7 @@ GEOMETRY = frozenset({"means", "quats", "log_scales", *LANGUAGE_SHAPE})
 
 
 def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None:
-    """Take the gradients of some parameters away.
+    """Turn off the gradients of the parameters that are to be kept.
 
     Raises:
         ValueError: If a name is unknown, or Gaussians would still multiply and die, or their weights be reset.
@@ -36,7 +36,7 @@ def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None
 
 
 class FrozenRenders:
-    """Renders of the training views from kept weights, wherever the weights that are asked for are constant.
+    """Renders the training views from kept blending weights, as far as these are constant.
 
     Args:
         model: Whose means, quats and scales do not change.

@@ -1,4 +1,4 @@
-"""Several mask levels learned by one model (``levels=joint``; systems.md D.8)."""
+"""Several mask levels learned by one model (``levels=joint``; conf/README.md)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

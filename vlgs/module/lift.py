@@ -1,4 +1,4 @@
-"""Language codes lifted from the training views onto Gaussians, without training (systems.md D.9, F.4)."""
+"""Language codes lifted from the training views onto Gaussians, without training."""
 
 import torch
 from jaxtyping import Float
@@ -25,7 +25,7 @@ def lift_features(module: VLGSModule) -> None:
         seen = target.valid[..., None].to(features)
         image = torch.cat([target.codes * seen, seen], dim=-1)
         for level, own in enumerate(weights):
-            total[level] += _gathered(module, index, own, image[:, level::levels].contiguous())
+            total[level] += gathered(module, index, own, image[:, level::levels].contiguous())
     with torch.no_grad():
         codes = features.unflatten(1, (levels, -1)).transpose(0, 1)
         lifted = total[..., :-1] / total[..., -1:].clamp_min(torch.finfo(total.dtype).tiny)
@@ -33,11 +33,12 @@ def lift_features(module: VLGSModule) -> None:
         features.copy_(lifted.transpose(0, 1).flatten(1))
 
 
-def _gathered(
+def gathered(
     module: VLGSModule, index: int, weight: Float[Tensor, " n"], image: Float[Tensor, "h w c"]
 ) -> Float[Tensor, "n c"]:
     """Per Gaussian the sum over pixels of its blending weight times the image."""
     values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
     camera = module.scene.train[index].camera
-    rendered = module.model.render_values(camera, values, weight)
-    return torch.autograd.grad(rendered, values, image)[0]
+    with torch.enable_grad():
+        rendered = module.model.render_values(camera, values, weight)
+        return torch.autograd.grad(rendered, values, image)[0]

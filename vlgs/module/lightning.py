@@ -1,4 +1,4 @@
-"""Training as one LightningModule: parameters, the step of Eq. overall, one Adam."""
+"""Training as one LightningModule: parameters, the step of Eq. 12, one Adam."""
 
 import math
 import time
@@ -26,7 +26,7 @@ from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
 TARGET_BYTES = 256 << 20
-"""Most memory for images and code maps kept as float32 for the losses: those of all views or, where they take more, of one iteration."""
+"""Most bytes of float32 images and code maps that are kept for the losses. If all views need more, those of one iteration are kept."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Target:
 
 @dataclass
 class StepReport:
-    """What the last iteration saw; callbacks read it, nothing is computed for it."""
+    """What the last iteration did, for callbacks. Recording it costs no extra computation."""
 
     step: int = -1
     views: tuple[str, ...] = ()
@@ -53,11 +53,11 @@ class StepReport:
     loss: float = math.nan
     color_mse: float = math.nan
     blend_weight: float = 0.0
-    """lambda * SSIM(I1, I2) of Eq. blend; 0 where the blended view was not rendered."""
+    """lambda * SSIM(I1, I2) of Eq. 11; 0 where the blended view was not rendered."""
 
 
 class VLGSModule(L.LightningModule):
-    """Two real views and one language-only blended view per iteration (Eqs. raster, blend, overall).
+    """Two real views and one language-only blended view per iteration (Eqs. 8, 11 and 12).
 
     Everything random is a function of (seed, step); `next_step` is the only counter, so a module that was saved after
     a step and restored goes on bit for bit as if it had never stopped.
@@ -66,7 +66,7 @@ class VLGSModule(L.LightningModule):
         model: What is trained.
         scene: Training views and language supervision.
         blend: The blended camera view.
-        losses: Losses of Eqs. raster, blend, overall.
+        losses: Losses of Eqs. 8, 11 and 12.
         gaussians_config: Densification.
         trainer_config: Budget, schedule and learning rates.
         seed: Seed of all draws.
@@ -177,7 +177,7 @@ class VLGSModule(L.LightningModule):
         if view.read_masks is None or not self.has_language:
             return Target(view, image, None, None)
         read = view.read_masks
-        # Row -1, "no mask", takes the zero code that stands last. A pixel of several mask levels becomes as many pixels of a row.
+        # "No mask" is -1, which indexes the last row, a zero code. With l mask levels, each pixel becomes l neighbours in its row.
         codes = kept.get((index, "codes"), lambda: self.mask_codes[read().long()].flatten(1, -2))
         valid = kept.get((index, "valid"), lambda: (read() >= 0).flatten(1))
         return Target(view, image, codes, valid)
@@ -202,7 +202,7 @@ class VLGSModule(L.LightningModule):
         return torch.cat([codes, torch.zeros(1, codes.shape[1])])
 
     def _room_for_targets(self) -> int:
-        """Bytes; a part of the views would be found again too seldom to be worth its memory."""
+        """Bytes for cached targets: all views if they fit, else the two views of one iteration. Caching some of the views would rarely help."""
         code = 4 * self.mask_codes.shape[1] + 1  # and whether it counts
         pixel = 3 * 4 + (code * self.scene.mask_levels if self.has_language else 0)
         views = [pixel * view.camera.width * view.camera.height for view in self.scene.train]
@@ -257,19 +257,13 @@ class VLGSModule(L.LightningModule):
     def _color_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.color is None:
             return torch.zeros(())
-        return self.losses.color_loss(render.color, target.image, _covered(target.view))
+        return self.losses.color_loss(render.color, target.image, covered(target.view))
 
     def _language_loss(self, render: ViewRender, target: Target) -> Float[Tensor, ""]:
         if render.feature is None or target.codes is None:
             return torch.zeros(())
         feature = render.feature.view_as(target.codes)
-        loss = self.losses.language_loss(feature, target.codes, target.valid)
-        if target.valid is None or self.losses.absent_weight == 0:
-            return loss
-        covered, absent = _covered(target.view), ~target.valid
-        if covered is not None:
-            absent &= covered.repeat_interleave(self.scene.mask_levels, dim=1)
-        return loss + self.losses.absent_loss(feature, absent)
+        return self.losses.language_loss(feature, target.codes, target.valid)
 
     def _backward(
         self, total: Tensor, color_losses: list[Tensor], renders: list[ViewRender]
@@ -312,7 +306,7 @@ class VLGSModule(L.LightningModule):
         renders: list[ViewRender],
         fused: FusedGaussians,
     ) -> Float[Tensor, ""]:
-        """Third term of Eq. overall."""
+        """Third term of Eq. 12."""
         (first, second), feature = targets, None
         assert first.codes is not None
         assert first.valid is not None
@@ -350,7 +344,7 @@ class VLGSModule(L.LightningModule):
             yield from self.model.fusion.named_parameters("fusion")
 
     def _refuse_non_finite(self, where: str) -> None:
-        """Stop before Adam spreads one bad number over everything (pitfalls N1)."""
+        """Stop before Adam spreads one bad number over everything (tests/README.md, N1)."""
         looked_at: dict[str, Tensor] = {}
         for name, parameter in self._trained():
             if parameter.grad is not None:
@@ -370,5 +364,6 @@ class VLGSModule(L.LightningModule):
                 )
 
 
-def _covered(view: View) -> Bool[Tensor, "h w"] | None:
+def covered(view: View) -> Bool[Tensor, "h w"] | None:
+    """Pixels that the photograph of a view covers; None for all."""
     return None if view.read_valid is None else view.read_valid()

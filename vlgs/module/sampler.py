@@ -1,4 +1,4 @@
-"""Which views an iteration sees: a pure function of (seed, step), so that a resumed run is the same run."""
+"""Chooses the views of an iteration as a pure function of (seed, step), so that a resumed run sees the same views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from vlgs.types import Camera
 
 @dataclass(frozen=True)
 class PairSampler:
-    """Two views per iteration, drawn from two independently shuffled stacks (systems.md D.13).
+    """Two views per iteration, drawn from two independently shuffled stacks (conf/README.md, D.13).
 
     Every view is visited once per epoch of each stack. Where both stacks show the same view, or two views whose images
     differ in size and so cannot be blended, the second one is drawn again among the views that fit.

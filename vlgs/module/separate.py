@@ -1,4 +1,4 @@
-"""Colour and language as two sets of Gaussians that share nothing (``sharing=none``; systems.md D.16)."""
+"""Colour and language as two sets of Gaussians that share nothing (``sharing=none``; conf/README.md, D.16)."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ NOWHERE = -100.0
 
 
 def without_language(scene: Scene) -> Scene:
-    """The scene as colour alone sees it."""
+    """The scene without its language supervision."""
     return replace(
         scene,
         train=tuple(replace(view, read_masks=None) for view in scene.train),
@@ -48,7 +48,7 @@ def for_language(parts: Parts) -> Parts:
 
 @torch.no_grad()
 def unite(color: SplatModel, language: SplatModel) -> SplatModel:
-    """One model of both sets, whose images are theirs bit for bit: in the other modality a Gaussian weighs exactly nothing.
+    """Join both sets in one model that renders the same bits. Each Gaussian has weight 0 in the other modality.
 
     Args:
         color: Renders colour.

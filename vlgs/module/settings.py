@@ -6,27 +6,27 @@ from dataclasses import asdict, dataclass, field
 from vlgs.values import require_range
 
 MOST_ITERATIONS = 10**9
-"""A thousand times what anybody trains."""
+"""Upper limit of `iterations`, far above any useful value."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's rates per parameter (tab:lr), 0 to 1; rates the paper does not give are marked. What has a rate of 0 does not learn."""
+    """Adam's rates per parameter (Table 7), 0 to 1; rates the paper does not give are marked. What has a rate of 0 does not learn."""
 
     means: float = 1.6e-4
     """Multiplied by the scene extent, decays log-linearly to `means_final` over `TrainerConfig.means_steps`."""
     means_final: float = 1.6e-6
-    """3DGS's final rate; the paper is silent (systems.md D.11)."""
+    """3DGS's final rate; the paper is silent (conf/README.md, D.11)."""
     quats: float = 1e-3
     log_scales: float = 5e-3
     sh0: float = 5e-3
     shN: float = 2.5e-4  # noqa: N815 (gsplat's name)
-    """sh0's rate / 20 as in 3DGS; the paper is silent (systems.md D.7)."""
+    """sh0's rate / 20 as in 3DGS; the paper is silent (conf/README.md, D.7)."""
     opacity_logits: float = 5e-2
     indicator_logits: float = 5e-2
     features: float = 5e-3
     fusion: float = 1e-3
-    """The paper is silent (systems.md D.6)."""
+    """The paper is silent (conf/README.md, D.6)."""
 
     def __post_init__(self) -> None:
         require_range("learning_rates", 0, 1, **asdict(self))
@@ -71,7 +71,7 @@ class TrainerConfig:
     sh_every: int = 1000
     """Iterations after which the next spherical harmonics degree joins."""
     means_steps: int | None = None
-    """Iterations over which the rate of the positions decays; None: all of the run (systems.md D.11)."""
+    """Iterations over which the rate of the positions decays; None: all of the run (conf/README.md, D.11)."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""

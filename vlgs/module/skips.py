@@ -1,4 +1,4 @@
-"""What training left out, how often, and what that saved."""
+"""Counts what training skipped, how often, and the time that this saved."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ class Work:
 
     done: int = 0
     seconds: float = 0.0
-    """Wall time of the forward part; what it adds to the backward pass is not known apart."""
+    """Wall time of the forward pass; its share of the backward pass cannot be measured separately."""
 
 
 @dataclass
@@ -34,7 +34,7 @@ class SkipCount:
     work: dict[str, Work] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     similarities: dict[tuple[int, int], float] = field(default_factory=dict)
-    """SSIM(I1, I2) per pair of views: constant, so computed once (systems.md D.12)."""
+    """SSIM(I1, I2) per pair of views: constant, so computed once (conf/README.md, D.12)."""
 
     @contextmanager
     def doing(self, work: str, count: int = 1) -> Iterator[None]:

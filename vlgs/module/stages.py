@@ -1,7 +1,7 @@
-"""Which models a run trains, one after the other, and what they make together.
+"""The stages of a run: the models that it trains, one after the other.
 
-Most runs train one model in the folder of the run. Others train several, each in a sub-folder with a checkpoint and a curve of its
-own; a stage that is done is read back from its checkpoint, so that the same command goes on wherever it was stopped.
+Most runs train one model, in the folder of the run. Others train several, each in a sub-folder with its own checkpoint and
+log.csv. A finished stage is loaded from its checkpoint, so that the same command continues where it was stopped.
 """
 
 import logging
@@ -76,7 +76,7 @@ class Stages:
 
     @property
     def kept(self) -> list[Stage]:
-        """What the result is made of: all but the models that others were made from."""
+        """The stages that the result consists of, without those that only prepared others."""
         return [stage for name, stage in self.done.items() if name not in (AUGMENT, GEOMETRY)]
 
     def train(self, name: str, scene: Scene, color: bool = True) -> SplatModel:
@@ -144,7 +144,7 @@ def train_all(
         stages: Where and with what.
         scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate`` and ``joint``.
         sharing: Whether colour and language are one model, and whether language is trained at all.
-        augment: Further training views, rendered from a first model of colour alone (systems.md D.17); what `Offline.require`
+        augment: Further training views, rendered from a first model of colour alone (conf/README.md, D.17); what `Offline.require`
             asks for is there.
         joint: Whether one model learns all levels.
 
@@ -182,7 +182,7 @@ def train_all(
 
 
 def all_skips(stages: Iterable[Stage]) -> SkipCount:
-    """What all stages left out together."""
+    """The skips of all stages together."""
     total = SkipCount()
     for stage in stages:
         for name, work in stage.skips.work.items():

@@ -1,4 +1,4 @@
-"""What a checkpoint of a run holds, and how it goes back into a module."""
+"""Saves the state of a module for a checkpoint, and restores it."""
 
 from typing import Any
 

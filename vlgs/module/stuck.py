@@ -1,4 +1,4 @@
-"""Gaussians that nothing can move any more: a weight under the cutoff or over the clamp has no gradient (pitfalls N11)."""
+"""Finds Gaussians that can no longer change, because their weight is below the cutoff or above the clamp and has no gradient (tests/README.md, N11)."""
 
 import logging
 from collections.abc import Sequence

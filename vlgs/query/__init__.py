@@ -29,7 +29,7 @@ __all__ = [
 
 @runtime_checkable
 class Query(Protocol):
-    """How the cosines between a pixel and some words become the relevancy of each prompt: the whole contract.
+    """The interface of a query: turns the cosines between a pixel and words into the relevancy of each prompt.
 
     A query is a function of cosines alone, so that decoding and the one large matrix product are shared by all queries and by
     the class map of the same view (`vlgs.query.similarity`).

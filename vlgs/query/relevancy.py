@@ -10,12 +10,12 @@ from torch import Tensor
 from vlgs.query.similarity import cosines
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
-"""LERF's words for anything at all (systems.md B.0)."""
+"""LERF's words for anything at all (Kerr et al., ICCV 2023)."""
 
 
 @dataclass(frozen=True)
 class LerfRelevancy:
-    """Relevancy of LERF and LangSplat: a two-way softmax against each negative, then the minimum (systems.md B.0).
+    """Relevancy of LERF and LangSplat: a two-way softmax against each negative, then the minimum.
 
     ``min_n exp(T cos+) / (exp(T cos+) + exp(T cos_n))`` equals ``sigmoid(T (cos+ - max_n cos_n))``, which is what is computed: it
     cannot overflow. 0.5 is a tie with the strongest negative.
@@ -62,7 +62,7 @@ class LerfRelevancy:
 
 @dataclass(frozen=True)
 class VocabSoftmax:
-    """The paper's formula: a softmax over the whole vocabulary, here all prompts (systems.md B.7).
+    """The paper's Eq. 4: a softmax over the whole vocabulary, here all prompts.
 
     With CLIP's cosines and T = 1 every value lies close to 1/k: only the order of pixels and of classes carries meaning, which
     is all that the min-max step of LERF-OVS and the argmax of the dense protocol look at.

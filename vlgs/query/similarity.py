@@ -1,4 +1,4 @@
-"""Cosines between language features and text, for one feature or for a whole view that is never decoded at once."""
+"""Cosines between language features and text, for single features or for a view, which is decoded in chunks."""
 
 from collections.abc import Callable
 
@@ -44,7 +44,7 @@ def decoded_cosines(
 ) -> Float[Tensor, "k h w"]:
     """Cosine of every text vector with every pixel of a rendered map of language codes.
 
-    Codes are decoded before they are compared (systems.md D.24). A view of one million pixels would be 2 GB of 512-d features;
+    Codes are decoded before they are compared (conf/README.md, D.24). A view of one million pixels would be 2 GB of 512-d features;
     here only `chunk` pixels are decoded at a time.
 
     Args:

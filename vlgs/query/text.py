@@ -16,7 +16,7 @@ CLIP_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 
 @runtime_checkable
 class TextEncoder(Protocol):
-    """Words to unit vectors: the whole contract. Options under conf/text are called with ``vocabulary=scene.vocabulary``."""
+    """The interface of a text encoder: words to unit vectors. Options under conf/text are called with ``vocabulary=scene.vocabulary``."""
 
     def encode(self, names: Sequence[str]) -> Float[Tensor, "k e"]:
         """One unit vector per word, in the order given.
@@ -67,7 +67,7 @@ class VocabularyText:
 
 
 class ClipText:
-    """A text tower through transformers, from local files only: raw words, no template (systems.md B.0).
+    """A text tower through transformers, from local files only: raw words, no template.
 
     CLIP's, or that of SigLIP and SigLIP 2. Those were trained on lower case, always padded to their full length on the right and
     without a mask, and look at the last position alone, so that words come to them in just this way. Nothing is loaded before the

@@ -1,4 +1,4 @@
-"""What can be asked of a scene: its classes, or where nobody labelled it, the words of its vocabulary."""
+"""The words that can be asked of a scene: its classes or, without labels, its vocabulary."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""A model as plain Gaussians: what another program needs to draw the same pictures, without fusion, indicator or vlgs."""
+"""Converts a model to plain Gaussians, from which another program draws the same pictures without fusion or indicator."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ HIGHEST_LOGIT = log(2.0**24 - 1)
 ROWS = 1 << 13
 """Gaussians whose harmonics are fitted at once: bounds the memory."""
 RIDGE = 1e-3
-"""Cost of a fitted harmonic beside the mean squared error over the views: what no view tells stays as it is."""
+"""Regularisation of the fitted harmonics: those that no view determines keep their value."""
 
 
 @dataclass(frozen=True)

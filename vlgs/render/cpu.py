@@ -1,4 +1,4 @@
-"""The kernel in `csrc` as two autograd functions: projecting, then blending, with `mean2d` between them."""
+"""The kernel in `csrc` as two autograd functions: projection, which gives `mean2d`, and blending."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -107,7 +107,7 @@ def _differentiated(tensors: Sequence[Tensor]) -> bool:
 
 
 class _Layout(NamedTuple):
-    """How groups hang on chains of transmittance, and what does not need a gradient."""
+    """Which group uses which chain of transmittance, and which of them need gradients."""
 
     width: int
     height: int
@@ -164,7 +164,7 @@ def _kernel_camera(camera: Camera, config: RasterConfig) -> _csrc.Camera:
 
 
 class Work(NamedTuple):
-    """How much a forward pass had to do."""
+    """The amount of work of a forward pass."""
 
     entries: int
     """Of all tile lists: (Gaussian, tile) pairs."""

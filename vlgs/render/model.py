@@ -24,11 +24,11 @@ class FusedGaussians:
 
     gaussians: Gaussians
     color: Float[Tensor, "n 3"]
-    """u_1..3 of Eq. attention: RGB before the view-dependent part is added."""
+    """u_1..3 of Eq. 5: RGB before the view-dependent part is added."""
     feature: Float[Tensor, "n d"]
-    """u_4.. of Eq. attention; the codes of all mask levels side by side with ``levels=joint``."""
+    """u_4.. of Eq. 5; the codes of all mask levels side by side with ``levels=joint``."""
     language_weight: Float[Tensor, " n *levels"]
-    """What blends language: l, o or a constant, as the indicator says (Eq. lancity)."""
+    """What blends language: l, o or a constant, as the indicator says (Eq. 6)."""
     rows: int
     """How many were fused; all, unless they were fused for some cameras alone."""
     level: int | None = None
@@ -53,17 +53,17 @@ class ViewRender:
 
 
 class SplatModel(nn.Module):
-    """What a checkpoint holds and an evaluation needs.
+    """A trained scene: the parameters in a checkpoint, and everything that is needed to render.
 
     Args:
         parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`, with or without `LANGUAGE_SHAPE`.
-        fusion: Mixes colour and language of each Gaussian (Eq. attention).
-        indicator: Chooses what blends language (Eq. lancity).
+        fusion: Mixes colour and language of each Gaussian (Eq. 5).
+        indicator: Chooses what blends language (Eq. 6).
         codec: Embedding to language code and back.
         raster: Constants of the rasterizer.
         sh_degree: Highest spherical harmonics degree in use, 0 to 3.
         evaluated: Whether colour is fused as each view sees it, so that what is blended as language depends on the view
-            (``gaussians.color=evaluated``, systems.md D.7); questions in 3D are then asked of the fusion with degree 0.
+            (``gaussians.color=evaluated``, conf/README.md, D.7); questions in 3D are then asked of the fusion with degree 0.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class SplatModel(nn.Module):
     def render_values(
         self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
     ) -> Float[Tensor, "h w c"]:
-        """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of fig. lancity-vis."""
+        """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of Fig. 3."""
         gaussians = self.gaussians()
         group = ChannelGroup(values, weight, shape=gaussians.language_shape)
         return self._rasterize(gaussians, [group], camera).images[0]

@@ -26,7 +26,7 @@ def rasterize(
     config: RasterConfig = DEFAULT,
     backend: Literal["cpu", "reference"] = "cpu",
 ) -> Rendered:
-    """Images of 3D Gaussians: every channel group blended front to back with its own weights (Eqs. rgb-render, lancity).
+    """Images of 3D Gaussians: every channel group blended front to back with its own weights (Eqs. 1 and 6).
 
     One depth order and one pass over the image serve all groups; each has its own transmittance, and groups that share one
     weight tensor share one. Where nothing lies, images and accumulated weights are exactly 0. Gradients reach `means`,

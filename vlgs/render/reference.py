@@ -34,7 +34,7 @@ def rasterize(
     camera: Camera,
     config: RasterConfig,
 ) -> Rendered:
-    """Image, accumulated weight and gradients as `vlgs.rasterize` defines them (Eqs. rgb-render, lancity)."""
+    """Image, accumulated weight and gradients as `vlgs.rasterize` defines them (Eqs. 1 and 6)."""
     splats = _project(means, quats, scales, camera, config)
     front_to_back = torch.argsort(splats.depth, stable=True)
     front_to_back = front_to_back[splats.in_front[front_to_back]]

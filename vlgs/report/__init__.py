@@ -1,1 +1,1 @@
-"""What a finished run says about itself: scores, speed, pictures, metrics.json and the summary on the terminal."""
+"""The report of a finished run: scores, speed, pictures, metrics.json and the summary on the terminal."""

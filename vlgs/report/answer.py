@@ -1,4 +1,4 @@
-"""One trained scene, one view, some prompts: what both the scores and the pictures are made from."""
+"""Renders one view of a trained scene and answers prompts in it. Scores and pictures are both made from this."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable

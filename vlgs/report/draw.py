@@ -1,4 +1,4 @@
-"""One held-out view as pictures: what was seen, what was rendered, what was answered."""
+"""Pictures of one held-out view: photograph, renders and answers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,7 +39,7 @@ class ViewPictures:
     features: UInt8[Tensor, "h w 3"] | None = None
     """Like `difference`, None where no language was trained."""
     difference: UInt8[Tensor, "h w 3"] | None = None
-    """l - o as seen from the view (fig. lancity-vis)."""
+    """l - o as seen from the view (Fig. 3)."""
     labels: UInt8[Tensor, "h w 3"] | None = None
     """True classes, where the view has one for every pixel."""
     prediction: UInt8[Tensor, "h w 3"] | None = None

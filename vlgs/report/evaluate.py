@@ -20,7 +20,7 @@ from vlgs.types import Scene, View
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of one run. None is not available, and `reasons` says why; it is never 0 or 1 by default."""
+    """Scores of one run. None means not available, and `reasons` says why; a missing score is never 0 or 1."""
 
     protocol: str
     """`vlgs.metrics.protocol.tag` of the headline: name, version and split, such as ``dense@1/synthetic``."""

@@ -1,4 +1,4 @@
-"""How far the semantic indicator departs from opacity: as a map of a view, and by kind of category (fig. lancity-vis)."""
+"""How far the semantic indicator departs from opacity: as a map of a view, and by kind of category (Fig. 3)."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Language scores gathered view by view: the headline's protocol, the two that always stand beside it, and ceilings."""
+"""Language scores, gathered view by view: by the chosen protocol, by two others for comparison, and the ceilings that exact features would reach."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

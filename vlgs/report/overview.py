@@ -1,4 +1,4 @@
-"""The sheet a person would show: views as rows, what the model makes of them as columns. Matplotlib, without a display."""
+"""overview.png: one row per view, with the photograph, the renders and the answers as columns. Matplotlib, without a display."""
 
 import io
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ WORDS = 6
 def count_difference(
     language: Float[Tensor, " n"], color: Float[Tensor, " n"], bins: int = 80
 ) -> Float[Tensor, " {bins}"]:
-    """Density of l - o over all Gaussians, in equal bins from -1 to 1 (right of fig. lancity-vis).
+    """Density of l - o over all Gaussians, in equal bins from -1 to 1 (right of Fig. 3).
 
     The area under it is 1; without Gaussians it is zero.
     """

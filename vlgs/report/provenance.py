@@ -39,7 +39,7 @@ def commit(package: Path = PACKAGE) -> str | None:
 
 
 def same_code(one: str | None, other: str | None, package: Path = PACKAGE) -> bool:
-    """Whether two answers of `commit` stand for the same code and configuration; of what is not committed nobody knows."""
+    """Whether two results of `commit` mean the same code and configuration; uncommitted changes never do."""
     if one is None or other is None or "+dirty" in one + other:
         return False
     return _git(package, "diff", "--quiet", one, other, "--", ".", "../csrc", "../conf") is not None

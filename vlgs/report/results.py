@@ -1,4 +1,4 @@
-"""metrics.json: one flat file per run, and the table that says what each entry means."""
+"""metrics.json, one flat file per run, and a table of the meaning of each entry."""
 
 import json
 import math
@@ -143,7 +143,7 @@ def write_queries(path: Path, evaluation: Evaluation) -> None:
 
 
 def metrics_table() -> str:
-    """The entries of metrics.json as a Markdown table, for README and ``--help``."""
+    """The entries of metrics.json as a Markdown table."""
     rows = [f"| `{name}` | {unit} | {meaning} |" for name, (unit, meaning) in METRICS.items()]
     return "\n".join(["| entry | unit | meaning |", "|---|---|---|", *rows])
 

@@ -77,7 +77,7 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
 
 
 def _text(text: str, style: str = "") -> Text:
-    """Words of a run as they are: neither rich's markup nor a terminal's control characters count in them."""
+    """Text of a run, printed literally: without rich's markup and a terminal's control characters."""
     return Text(screen(text), style=style)
 
 

@@ -1,4 +1,4 @@
-"""Frames per second of a trained scene at the size of its data (systems.md B.6)."""
+"""Frames per second of a trained scene at the size of its data."""
 
 import itertools
 import statistics

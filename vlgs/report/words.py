@@ -1,4 +1,4 @@
-"""Which words of a vocabulary the pictures ask where nobody labelled the scene."""
+"""Chooses the words that the pictures ask in a scene without labels."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ from vlgs.report.pictures import PictureLimits, spread
 from vlgs.types import Scene
 
 _SHARE = 1e-3
-"""Of the pixels: a word that is the best one on fewer is taken last."""
+"""Share of the pixels; words that are the best one on fewer pixels are taken last."""
 
 _VALUES = 1 << 24
 """Cosines that are held at once, 64 MB: of few pixels with many words, and of many with few."""

@@ -1,4 +1,4 @@
-"""How far two sets of cameras of the same photographs are apart, whatever their worlds' place, turn and scale."""
+"""The distance between two sets of cameras of the same photographs, after their worlds are aligned by a similarity transform."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,8 +1,8 @@
 """COLMAP's pipeline, run as a script in a process of its own: ``python worker.py FOLDER``.
 
-It imports nothing of vlgs and no Pillow, so that a crash of the native code or its threads reach no one else. FOLDER holds
-``settings.json``; what is left there is the database, ``sparse/<n>`` for each model, ``stage.txt`` and ``registered.txt``.
-Features and matches that the database has are not computed again.
+A crash of the native code then ends this process only; it imports neither vlgs nor Pillow. FOLDER has ``settings.json``. The
+script writes the database, ``sparse/<n>`` for each model, ``stage.txt`` and ``registered.txt`` there. Features and matches that are
+in the database already are not computed again.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""On what the tables of a folder are run, and which run a row means there. Imports no torch."""
+"""The data, scenes and seeds behind the tables of one results folder, and the run that belongs to each row. Imports no torch."""
 
 import hashlib
 import json
@@ -34,7 +34,7 @@ class UnknownOptionError(ValueError):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """On what the rows of a table are run: `results/<name>/benchmark.yaml`, committed with the tables."""
+    """Data, scenes and seeds that every row of a table is run with: `results/<name>/benchmark.yaml`, committed with the tables."""
 
     name: str
     """Folder of the tables below `results`."""
@@ -63,7 +63,7 @@ class Benchmark:
         return tuple(o for o in self.overrides if _moves(o))
 
     def extend(self, path: Path) -> "Benchmark":
-        """Say in a file what the tables beside it are run on, or add scenes and seeds to what it says.
+        """Write the benchmark to a file beside its tables, or add its scenes and seeds to that file.
 
         Returns:
             What the file says now.
@@ -122,7 +122,7 @@ class Benchmark:
 
 
 class Composer:
-    """Row to identity; every distinct row is composed once, and remembered in a file if there is one.
+    """Finds the identity of rows. Each distinct row is composed once and, if a file is given, remembered in it.
 
     Args:
         benchmark: Data, scenes and seeds.

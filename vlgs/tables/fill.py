@@ -1,6 +1,6 @@
-"""From runs to the numbers of one table: mean and deviation over seeds beside the paper's value.
+"""Computes the numbers of one table from runs: mean and deviation over seeds, beside the paper's value.
 
-Plain loops: of frames as small as one table's, pandas would take most of the time that all tables take.
+Plain loops, because pandas is slow on frames as small as those of one table.
 """
 
 import math
@@ -16,7 +16,7 @@ from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE, Table
 
 MEAN = "mean of "
-"""Before the kind, in the column of the mean over the categories of a kind."""
+"""Prefix of the column with the mean over the categories of a kind."""
 
 
 class Number(NamedTuple):
@@ -70,7 +70,7 @@ class Filled:
     numbers: Sequence[Number]
     """Every single number behind the cells."""
     runs: Sequence[Line]
-    """The runs behind the cells: a line of each, whichever."""
+    """One line of each run behind the cells."""
     provenance: tuple[str, ...]
     """Machine, commit, protocol, seeds and data of those runs, as text."""
 

@@ -123,7 +123,7 @@ def _damaged(path: Path, line: int, got: object) -> str:
 
 
 def add_kept(found: Sequence[Line], results: Path) -> list[Line]:
-    """The lines of all runs that have a folder, and those of runs.csv of runs that have none: published results outlive their folders.
+    """The lines of all runs that have a folder and, from runs.csv, of runs whose folder is gone.
 
     A run with a folder takes the place of one without that fills the same row, scene and seed.
 

@@ -1,4 +1,4 @@
-"""The printed arrangement of a table, the same for LaTeX, Markdown and HTML."""
+"""The layout of a table, shared by LaTeX, Markdown and HTML."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""A table in Markdown, and the head that every committed file of results carries."""
+"""Tables as Markdown and CSV."""
 
 import math
 

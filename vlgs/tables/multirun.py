@@ -1,4 +1,4 @@
-"""What a multirun (`python -m vlgs.run -m ...`) ends with: one table of its runs, on whichever launcher they ran."""
+"""The table that is printed at the end of a multirun (`python -m vlgs.run -m ...`), for every launcher."""
 
 import atexit
 import json
@@ -18,11 +18,11 @@ from vlgs.runs import UNSCORED, RunFolder
 from vlgs.tables.runs import Run, compare
 
 _ran: list[Path] = []
-"""Folder of the run that this process is at, told by `note_run`."""
+"""Folder of the current run of this process, set by `note_run`."""
 
 
 def note_run(folder: Path) -> None:
-    """Say where the run of this job lies, for the table."""
+    """Record the folder of this job's run, for the table."""
     _ran[:] = [folder]
 
 

@@ -1,4 +1,4 @@
-"""What a table can print: a number of metrics.json in the unit that the field prints it in."""
+"""The quantities that a table can print: keys of metrics.json, each with its usual unit."""
 
 from dataclasses import dataclass
 

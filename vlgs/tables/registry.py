@@ -33,7 +33,17 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 DEEPEST = 100
 """Lists and mappings in each other that a file may have."""
 
-_TABLE_KEYS = {"label", "caption", "dataset", "scenes", "metrics", "by", "categories", "rows"}
+_TABLE_KEYS = {
+    "label",
+    "number",
+    "caption",
+    "dataset",
+    "scenes",
+    "metrics",
+    "by",
+    "categories",
+    "rows",
+}
 _ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
@@ -46,7 +56,7 @@ class Row:
     overrides: tuple[str, ...] | None
     """Hydra overrides that make the run; None where the method is not built."""
     method: str = ""
-    """Name in conf/method of a method that is not built yet."""
+    """Name of a method that is not built yet."""
     group: str = ""
     """Part of the table that the row belongs to."""
     marks: Mapping[str, bool] = field(default_factory=lambda: _EMPTY)
@@ -73,6 +83,8 @@ class Table:
     rows: tuple[Row, ...]
     by_category: bool = False
     """Columns are the categories of a scene instead of scenes."""
+    number: int | None = None
+    """Number of the table in the paper's PDF, by which comments cite it; None for a table of our own."""
     kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
     """Category -> ``translucent_reflective`` or ``other``."""
 
@@ -129,6 +141,9 @@ def load_table(path: Path) -> Table:
         )
     if not is_label(label):
         raise ValueError(f"{where}: label must be letters, digits, dots and dashes, got {label!r}")
+    printed = content.get("number")
+    if printed is not None and (type(printed) is not int or printed < 1):
+        raise ValueError(f"{where}: number must be a whole number from 1, got {briefly(printed)}")
     metrics = tuple(_require(where, content, "metrics", list, str))
     for metric in metrics:
         if metric not in QUANTITIES:
@@ -150,6 +165,7 @@ def load_table(path: Path) -> Table:
         raise ValueError(f"{where}: rows must be at least 1, got none")
     return Table(
         label=label,
+        number=printed,
         caption=_require(where, content, "caption", str),
         dataset=_require(where, content, "dataset", str),
         scenes=scenes,

@@ -1,4 +1,4 @@
-"""What the numbers of a table say: paired differences against the full model, and agreement with the paper's order."""
+"""Statistics of a table: paired differences from the full model, and agreement with the order of the rows in the paper."""
 
 import itertools
 import math

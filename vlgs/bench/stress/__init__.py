@@ -1,7 +1,7 @@
 """Numerical truth: inputs on which systems of this kind are known to fail, each with the criterion it must meet.
 
 One list of cases: `python -m vlgs.bench stress` runs them at full size (10^4 to 10^6), the tests run them small. The numbers
-N1 to N19 are those of the project's list of known failures.
+N1 to N19 are those of the list of known failures in tests/README.md.
 """
 
 from vlgs.bench.stress.bits import BITS

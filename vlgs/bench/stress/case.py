@@ -27,7 +27,7 @@ class Case:
     """One named case; the docstring of `run` is its pass criterion."""
 
     name: str
-    """Number in the list of known failures and a word: ``N4 needles``."""
+    """Number in tests/README.md and a word: ``N4 needles``."""
     run: Callable[[bool], Verdict]
     """Takes whether the case is run at full size, as the command does, or small, as the tests do. May raise `CannotRunError`."""
     minutes: int = 0

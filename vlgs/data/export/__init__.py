@@ -1,10 +1,10 @@
 """Write a scene to disk in the formats that the field reads, and that `vlgs.data.colmap` reads back.
 
 <root>/images/<stem>.png
-<root>/sparse/0/{cameras,images,points3D}.bin          COLMAP (systems.md C.1)
+<root>/sparse/0/{cameras,images,points3D}.bin          COLMAP's binary model
 <root>/labels/<stem>.png and classes.json              class ids per pixel, exact
-<root>/label/<stem>.json                               LERF-OVS polygons (C.2); polygons cannot have holes
-<root>/language_features/<stem>_s.npy, <stem>_f.npy    LangSplat (C.4), and vocabulary.npz
+<root>/label/<stem>.json                               polygons as in LERF-OVS; they cannot have holes
+<root>/language_features/<stem>_s.npy, <stem>_f.npy    as in LangSplat, and vocabulary.npz
 """
 
 import json

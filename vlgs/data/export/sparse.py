@@ -1,4 +1,4 @@
-"""COLMAP's binary model (systems.md C.1), written from cameras and coloured points."""
+"""COLMAP's binary model ("Output Format" in its documentation), written from cameras and coloured points."""
 
 import struct
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from vlgs.types import Camera, Scene, View
 
 _PINHOLE = 1
 _ALIKE = 24
-"""Greatest step of a channel, of 255, between a point and a pixel that is taken for an observation of it."""
+"""Largest difference per colour channel (of 255) between a point and a pixel that counts as its observation."""
 
 
 def write_sparse(folder: Path, scene: Scene, views: Sequence[View]) -> None:

@@ -14,8 +14,8 @@ def open_labels(folder: Path) -> tuple[DenseFolder | ObjectFolder | None, tuple[
     """Read what a label folder says about itself; the pixels of dense labels stay on disk.
 
     Args:
-        folder: ``classes.json`` and ``<stem>.png``; or ``classes.txt`` and ``<stem>/<class>.png`` (3D-OVS, S. C.3); or one
-            ``<stem>.json`` per labelled image (LERF-OVS, S. C.2); or ``<prompt>/masks/<stem>.png`` (GOI, S. B.4).
+        folder: ``classes.json`` and ``<stem>.png``; or ``classes.txt`` and ``<stem>/<class>.png`` (3D-OVS); or one
+            ``<stem>.json`` per labelled image (LERF-OVS); or ``<prompt>/masks/<stem>.png`` (GOI).
 
     Returns:
         The folder, None if it is neither, and everything wrong with it.

@@ -1,4 +1,4 @@
-"""Labels as one binary mask per class and image, in the two layouts that releases have them in (S. B.4, C.3).
+"""Labels as one binary mask per class and image, in the two layouts of two releases.
 
 3D-OVS: ``classes.txt`` (a class per line) and ``<stem>/<class>.png``.
 GOI on Mip-NeRF 360: ``<prompt>/masks/<stem>.png``.

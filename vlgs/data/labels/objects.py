@@ -1,4 +1,4 @@
-"""LERF-OVS labels: one JSON a view, an object a polygon and a box (S. C.2).
+"""LERF-OVS labels: one JSON a view, an object a polygon and a box.
 
 {"info": {"name": "frame_00001.jpg", "width": 988, "height": 730},
  "objects": [{"category": "plate", "segmentation": [[x, y], ...], "bbox": [x1, y1, x2, y2]}]}
@@ -106,7 +106,7 @@ class ObjectFolder:
     def by_position(self, names: Sequence[str]) -> "ObjectFolder":
         """The same labels for the n-th of the images where they are called ``frame_<n>``, n from 1.
 
-        So GAGS and LangSplatV2 number their labels of images that have other names (S. B.4). Labels that have the stem of
+        So GAGS and LangSplatV2 number their labels of images that have other names. Labels that have the stem of
         an image, or no such number, stay as they are.
 
         Args:

@@ -1,7 +1,7 @@
-"""COLMAP's ``.bin`` files, with every count held against the size of the file before it is believed (S. C.1).
+"""COLMAP's ``.bin`` files. Every count in them is checked against the size of the file first.
 
-COLMAP's own reader loads a truncated ``cameras.bin`` as garbage and follows a garbled count until memory ends, hence this
-one: it reads to the last byte or raises, and takes no more memory than the file is long.
+COLMAP's own reader returns garbage for a truncated ``cameras.bin``, and a damaged count makes it use up all memory. This one
+reads the file to its last byte or raises an error, and needs no more memory than the file has bytes.
 """
 
 import struct

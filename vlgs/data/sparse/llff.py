@@ -1,4 +1,4 @@
-"""LLFF's ``poses_bounds.npy`` as a `SparseModel` without points: how 3D-OVS was released (S. C.3).
+"""LLFF's ``poses_bounds.npy`` as a `SparseModel` without points: how 3D-OVS was released.
 
 Row i belongs to the i-th image in order of name: a 3 x 5 matrix by rows, then the near and far bound, which are not used. Columns are
 the camera's down, right and back axis in the world, its position, and (height, width, focal length).

@@ -1,4 +1,4 @@
-"""A COLMAP reconstruction as plain values, and what must hold for it to be used (S. C.1)."""
+"""A COLMAP reconstruction as plain values, and what must hold for it to be used."""
 
 import re
 from collections import Counter
@@ -92,7 +92,7 @@ class SparseImage:
 
 @dataclass(frozen=True)
 class SparseModel:
-    """What the three files of one reconstruction say, in their order; not yet judged."""
+    """The content of the three files of a reconstruction, in their order and not yet checked."""
 
     folder: Path
     suffix: str

@@ -1,4 +1,4 @@
-"""COLMAP's ``.txt`` files (S. C.1)."""
+"""COLMAP's ``.txt`` files ("Output Format" in its documentation)."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

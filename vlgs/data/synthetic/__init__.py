@@ -9,7 +9,7 @@ have the geometry of CLIP's (`language`).
 What each scene tests.
 
 * ``glassware``: translucent things. Colour behind glass is that of what lies behind, language is that of the glass: the
-  claim behind the semantic indicator (Eq. lancity).
+  claim behind the semantic indicator (Eq. 6).
 * ``mirrors``: steel and mirrors. Colour moves with the viewer and glare moves with the lamp, language stays.
 * ``lookalikes``: eight different things of one red. Colour does not tell classes apart.
 * ``patchwork``: things of many colours each. Colour tells apart what is one.

@@ -24,7 +24,7 @@ from vlgs.types import Vocabulary
 
 WIDTH = 512
 NEGATIVES = ("object", "things", "stuff", "texture")
-"""LERF's canonical phrases (systems.md B.0)."""
+"""The canonical phrases of LERF (Kerr et al., ICCV 2023)."""
 
 _COMMON = 0.8
 _MODALITY = 0.8

@@ -1,4 +1,4 @@
-"""Things that colour tells everything about: red ones, ones of many colours, and plain company. See `props_shiny`."""
+"""Opaque things: red ones, ones of many colours, and plain ones. See `props_shiny`."""
 
 from vlgs.data.synthetic.materials import (
     BLACK,

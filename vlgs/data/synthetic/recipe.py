@@ -1,4 +1,4 @@
-"""What a procedural scene is a function of."""
+"""The settings that determine a procedural scene."""
 
 import hashlib
 from dataclasses import astuple, dataclass, field, replace
@@ -10,7 +10,7 @@ from vlgs.data.synthetic.masks import Faults
 VERSION = 1
 """Part of every fingerprint; raise it with any change that moves a pixel, a label, a point or a vector."""
 MAX_VIEWS = 9999
-"""Training views; the faults of views that nobody photographed are drawn by numbers above."""
+"""Largest number of training views. The label faults of further, rendered views are drawn with higher numbers."""
 
 
 @dataclass(frozen=True)

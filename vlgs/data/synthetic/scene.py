@@ -1,4 +1,4 @@
-"""A procedural scene as training and evaluation want it."""
+"""A procedural scene as a `vlgs.types.Scene`, ready for training and evaluation."""
 
 import zlib
 from collections.abc import Callable, Mapping
@@ -101,7 +101,7 @@ def language_levels(
 def _supervise(
     recipe: Recipe, cache: Path | None, level: int, camera: Camera, number: int
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]]:
-    """What stands in for SAM and CLIP on a rendered image: the exact regions at that camera, spoilt like those of a photograph.
+    """Language maps of a rendered image, in place of SAM and CLIP: the exact regions at its camera, with errors like those of a photograph.
 
     Real extractors would also stumble over the faults of the render.
     """

@@ -1,4 +1,4 @@
-"""Photographs of a scene, taken once, and what its segmenters could find in them."""
+"""All photographs of a scene, and the exact masks in them. They are rendered once."""
 
 import functools
 import io

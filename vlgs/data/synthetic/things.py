@@ -19,7 +19,7 @@ class Material:
 
     pattern: Pattern
     kind: Literal["matte", "glass", "mirror", "light"] = "matte"
-    """A light is as bright as its pattern, whatever falls on it."""
+    """Which shading is used. A ``light`` is as bright as its pattern, without any other light on it."""
     gloss: float = 0.0
     """Strength of the highlight, which moves with the viewer."""
     opacity: float = 1.0

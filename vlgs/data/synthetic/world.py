@@ -1,4 +1,4 @@
-"""Things laid out for rays: who is hit first, with which colour and normal, and how much lamp light arrives."""
+"""Intersection of rays with all things of a scene: the first hit, its colour and normal, and how much light of the lamp arrives there."""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,7 @@
-"""Files that others wrote, read so that the worst of them is one error: who, where, what, and what to do.
+"""Readers for files from others. A damaged or hostile file gives one error, which says which file, where, what and what to do.
 
-Whatever a file declares (elements, pixels, array sizes) is held against its length before anything is allocated, so that a small file
-takes little memory and little time. Every error is a `vlgs.data.faults.SceneError`.
+Sizes that a file declares (elements, pixels, arrays) are compared with its length before memory is allocated: a small file
+needs little memory and little time. Every error is a `vlgs.data.faults.SceneError`.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""NumPy's npy and npz: headers are read by their own small grammar, and sizes are held against the bytes that there are."""
+"""NumPy's npy and npz files. A small parser reads the headers, and sizes are compared with the bytes that are there."""
 
 import math
 import re
@@ -22,9 +22,9 @@ _ENTRY = re.compile(
 _DTYPE = re.compile(r"[<>|=]?[biufU]\d{1,9}")
 
 _FREE = 64 << 20
-"""Bytes that any member of an npz may unfold to."""
+"""Bytes that every member of an npz may have when it is decompressed."""
 _RATIO = 50
-"""Beyond that, unfolded bytes per byte in the file: vectors hardly shrink, words by ten; zeros do by a thousand."""
+"""Beyond that, largest ratio of decompressed to compressed bytes: 1 for vectors, 10 for words, but 1000 for zeros."""
 
 _BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError)
 """What zipfile raises on a damaged or encrypted archive."""

@@ -1,4 +1,4 @@
-"""Image files: a few formats, by their content, and no more pixels than such a file can mean."""
+"""Image files of a few formats, recognised by their content. A file that would decode to far too many pixels is refused."""
 
 import struct
 import zlib

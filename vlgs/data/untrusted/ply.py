@@ -1,4 +1,4 @@
-"""The vertices of a PLY file, as columns; its header is believed only as far as the bytes go."""
+"""The vertices of a PLY file, as columns. The counts of the header are compared with the bytes that are there."""
 
 import re
 from collections.abc import Mapping
