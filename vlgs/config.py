@@ -1,13 +1,9 @@
-"""The configuration: where it lives, what it may construct, and which run it names. Imports no torch."""
+"""The configuration: where it lives and what it may construct. Imports no torch."""
 
-import hashlib
 import inspect
-import json
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -17,22 +13,6 @@ from vlgs import targets
 from vlgs.known import CONF as CONF
 from vlgs.known import is_ours, join, last, nodes, unread
 from vlgs.values import require_range, require_types
-
-NOT_PART_OF_A_RUN = frozenset(
-    {
-        "data",
-        "results",
-        "logger",
-        "progress",
-        "pictures",
-        "on_existing",
-        "threads",
-        "plugins",
-        "hydra",
-    }
-)
-"""Keys that cannot move a number. `data` is replaced by the fingerprint of the scene it leads to, so that a run does
-not depend on the folder that its data lies in."""
 
 LEVELS = (1, 2, 3)
 """Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (conf/README.md, D.8)."""
@@ -50,9 +30,6 @@ _NOT_LEARNED = ("vlgs.indicator.ColourOpacity", "vlgs.indicator.Fixed")
 
 MOST_THREADS = 256
 """Largest number of threads; no machine has more, and starting them would fail half-way."""
-
-GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
-"""Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
 
 def check_config(config: DictConfig) -> None:
@@ -206,20 +183,6 @@ def _who(config: Any, key: str, target: str) -> str:
     return last(key) or last(str(config._get_full_key(None) or "")) or target.rpartition(".")[2]
 
 
-RESULTS_VERSION = 4
-"""Part of every run id; raised by a change that can move a number."""
-
-PLACES = frozenset(
-    {"root", "labels", "features", "vocabulary", "release", "cache_bytes", "cache", "scene"}
-)
-"""Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
-
-
-def run_id(config: DictConfig, fingerprint: str) -> str:
-    """Hash of all that can move a number: the resolved configuration, the data's content and the results version."""
-    return _digest({"config": _moving(config), "data": fingerprint})
-
-
 def split_override(override: str) -> tuple[str, str]:
     """Key and value of a command-line argument; the value is empty where there is no ``=``."""
     key, _, value = override.partition("=")
@@ -274,54 +237,3 @@ def override_value(argument: str) -> Any:
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     return OverridesParser.create().parse_override(argument).value()
-
-
-@dataclass(frozen=True)
-class Identity:
-    """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""
-
-    recipe: str
-    """Hash of the configuration without data and seed."""
-    data: str
-    """Hash of how the data is read, wherever it lies and whichever scene it is."""
-    seed: int
-
-
-def identity(config: DictConfig) -> Identity:
-    """What tells runs of a table apart; see `Identity`."""
-    moving = _moving(config)
-    seed = moving.pop("seed")
-    given = {key: config.get(group, {}).get(key) for group, key in GIVEN_FILES}
-    moving["given"] = {key: Path(path).name for key, path in given.items() if path is not None}
-    data = OmegaConf.to_container(config.data, resolve=True, throw_on_missing=False)
-    assert isinstance(data, dict)
-    kept = {str(k): v for k, v in data.items() if k not in PLACES}
-    return Identity(_digest(moving), _digest(kept), seed)
-
-
-def _moving(config: DictConfig) -> dict[str, Any]:
-    """The part of a configuration that can move a number, without the data."""
-    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    assert isinstance(plain, dict)
-    kept = {str(k): v for k, v in plain.items() if k not in NOT_PART_OF_A_RUN}
-    if isinstance(kept.get("codec"), dict):
-        kept["codec"] = {k: v for k, v in kept["codec"].items() if k != "cache_dir"}
-    kept.pop("features", None)  # what it says stands in `augment` too
-    if "augment" in kept:
-        kept["augment"] = _without(kept["augment"], frozenset({"weights", "device"}))
-    for group, key in GIVEN_FILES:
-        if isinstance(kept.get(group), dict):
-            kept[group] = {k: v for k, v in kept[group].items() if k != key}
-    return kept
-
-
-def _without(node: Any, keys: frozenset[str]) -> Any:
-    if isinstance(node, dict):
-        return {key: _without(value, keys) for key, value in node.items() if key not in keys}
-    return node
-
-
-def _digest(content: dict[str, Any]) -> str:
-    content = content | {"results_version": RESULTS_VERSION}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()

@@ -38,6 +38,8 @@ class _Schema:
     targets: Mapping[str, frozenset[str]]
     arguments: Mapping[str, frozenset[str]]
     keys: frozenset[str]
+    naming: Mapping[tuple[str, str], tuple[Path, ...]]
+    """(last name of a group, target) -> files of the group that say it, in alphabetical order."""
 
 
 def targets(name: str) -> frozenset[str]:
@@ -50,6 +52,54 @@ def targets(name: str) -> frozenset[str]:
     return _schema().targets.get(name, frozenset())
 
 
+def option(key: str, target: str, folders: Collection[Path] = ()) -> str | None:
+    """The option that constructs a class at a key: the one file of the key's group that names the class.
+
+    Args:
+        key: Dotted; its last name is the group's: ``fusion``, ``augment.extractor.encoder``.
+        target: Of the class.
+        folders: Further ones with options, of the user's own. Theirs is no name that one of ours has.
+
+    Returns:
+        None where no file names it.
+
+    Raises:
+        ValueError: If several files do, so that none of them is the option's name.
+
+    Example:
+        >>> option("fusion", "vlgs.fusion.mlp.MLP")
+        'mlp'
+    """
+    group = last(key)
+    naming = _schema().naming
+    files = naming.get((group, target), ())
+    if not files:
+        taken = {path.stem for (own, _), ours in naming.items() if own == group for path in ours}
+        theirs = (path for folder in folders for path in sorted(folder.rglob(f"{group}/*.yaml")))
+        free = (path for path in theirs if path.stem not in taken)
+        files = tuple(path for path in free if _says(contents(path), target))
+    if len(files) > 1:
+        raise ValueError(
+            f"config: {target} must be named by one file of {files[0].parent}, got {' and '.join(path.name for path in files)}: the id "
+            f"of a run has the file's name; begin the others with `defaults: [{files[0].stem}, _self_]`, and keep what differs"
+        )
+    return files[0].stem if files else None
+
+
+def _says(content: Any, target: str) -> bool:
+    return isinstance(content, Mapping) and content.get("_target_") == target
+
+
+def is_group(key: str) -> bool:
+    """Whether what stands at a key is chosen among options.
+
+    Example:
+        >>> is_group("fusion"), is_group("augment.extractor.encoder"), is_group("gaussians.densify")
+        (True, True, False)
+    """
+    return last(key) in _group_names()
+
+
 def is_ours(target: object) -> bool:
     """Whether a target stands in `conf`, wherever."""
     return any(target in [*names] for names in _schema().targets.values())
@@ -59,6 +109,11 @@ def groups() -> frozenset[str]:
     """Folders of options, without Hydra's own: ``data``, ``features/encoder``."""
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")}
     return frozenset(f for f in folders if f != "." and f.partition("/")[0] != "hydra")
+
+
+@cache
+def _group_names() -> frozenset[str]:
+    return frozenset(group.rpartition("/")[2] for group in groups())
 
 
 def options(group: str) -> list[str]:
@@ -158,8 +213,13 @@ def _schema() -> _Schema:
     names: dict[str, set[str]] = defaultdict(set)
     at: dict[str, set[str]] = defaultdict(set)  # key -> targets that stand there
     keys: set[str] = set()
+    naming: dict[tuple[str, str], tuple[Path, ...]] = defaultdict(tuple)
     files = [path for path in CONF.rglob("*.yaml") if path.relative_to(CONF).parts[0] != "hydra"]
-    every = [pair for path in files for pair in nodes(contents(path), place(path))]
+    read = [(path, *pair) for path in sorted(files) for pair in nodes(contents(path), place(path))]
+    every = [(key, node) for _, key, node in read]
+    for path, key, node in read:
+        if path.parent.name == last(key) and "_target_" in node:
+            naming[last(key), node["_target_"]] += (path,)
     for key, node in every:
         keys |= {key, *(join(key, name) for name in node if name != "defaults")}
         target = node.get("_target_")
@@ -174,4 +234,5 @@ def _schema() -> _Schema:
         {key: frozenset(values) for key, values in found.items()},
         {key: frozenset(values) - {"defaults"} for key, values in names.items()},
         frozenset(keys),
+        naming,
     )

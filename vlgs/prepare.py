@@ -10,8 +10,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from vlgs.config import GIVEN_FILES, LEVELS, check_config, instantiate, run_id
+from vlgs.config import LEVELS, check_config, instantiate
 from vlgs.data.faults import Fault, warning
+from vlgs.identity import GIVEN_FILES, run_id
 from vlgs.places import record
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ class Prepared:
     """What a run is made of, and the id that follows from it."""
 
     scenes: Scenes
+    content: str
+    """Stands for all that was read: fingerprints of the scenes, digests of files that are given."""
     run_id: str
 
 
@@ -58,7 +61,8 @@ def prepare(config: DictConfig) -> Prepared:
     augment.require(scenes)
     content = [*(scene.fingerprint for scene in scenes.values()), augment.identity()]
     content += [file_digest(path, key) for key, path in given.items() if path]
-    return Prepared(scenes, run_id(config, " ".join(filter(None, content))))
+    read = " ".join(filter(None, content))
+    return Prepared(scenes, read, run_id(config, read))
 
 
 def doubts(config: DictConfig) -> Iterator[Fault]:

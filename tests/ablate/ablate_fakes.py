@@ -17,7 +17,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vlgs.ablate import job
-from vlgs.config import CONF, RESULTS_VERSION, identity, override_value, run_id
+from vlgs.config import CONF, override_value
+from vlgs.identity import RESULTS_VERSION, identity, run_id
 from vlgs.runs import BUSY, STOPPED, RunFolder
 
 TABLE = """

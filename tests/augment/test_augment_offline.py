@@ -8,9 +8,10 @@ import pytest
 import torch
 from tiny_runs import TINY, composed
 
-from vlgs.config import instantiate, run_id
+from vlgs.config import instantiate
 from vlgs.features.extractor import MaskFeatures
 from vlgs.geometry import camera_center
+from vlgs.identity import run_id
 from vlgs.module.augment import Offline
 from vlgs.module.build import Parts, build_module
 from vlgs.module.sampler import PairSampler, nearest_views

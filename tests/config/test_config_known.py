@@ -1,6 +1,8 @@
 """`conf` is the schema: it mirrors the constructors, and `--help` prints it."""
 
 import inspect
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra.utils import get_object
@@ -16,11 +18,20 @@ SINCE_THE_SCENE = {"vocabulary"}
 """Given by the run, not by the configuration."""
 
 
+def whole(path: Path) -> dict[str, Any]:
+    """An option with what it says itself and what the option says that it begins with."""
+    content = contents(path)
+    above = [name for name in content.get("defaults", []) if isinstance(name, str)]
+    files = [path.with_name(f"{name}.yaml") for name in above if name.isidentifier()]
+    first = {k: v for file in files if file.is_file() for k, v in whole(file).items()}
+    return {key: value for key, value in (first | content).items() if key != "defaults"}
+
+
 def constructed() -> dict[str, set[str]]:
     """Target -> all keys that any file of conf gives it."""
     found: dict[str, set[str]] = {}
     for path in CONF.rglob("*.yaml"):
-        for _, node in nodes(contents(path), place(path)):
+        for _, node in nodes(whole(path), place(path)):
             target = node.get("_target_")
             if isinstance(target, str) and target.startswith("vlgs."):
                 found.setdefault(target, set()).update(map(str, node))

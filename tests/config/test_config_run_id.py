@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import check_targets, identity, instantiate, run_id
+from vlgs.config import check_targets, instantiate
+from vlgs.identity import identity, run_id
 
 
 def config(**changes: object) -> DictConfig:
@@ -38,7 +39,7 @@ def test_the_id_follows_the_configuration(change: dict):
 
 def test_the_id_follows_data_and_results_version(monkeypatch: pytest.MonkeyPatch):
     ids = {run_id(config(), "f"), run_id(config(), "g")}
-    monkeypatch.setattr("vlgs.config.RESULTS_VERSION", 1_000_000)
+    monkeypatch.setattr("vlgs.identity.RESULTS_VERSION", 1_000_000)
     assert len(ids | {run_id(config(), "f")}) == 3
 
 

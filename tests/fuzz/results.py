@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from tests.fuzz.judge import Attack
-from vlgs.config import RESULTS_VERSION
+from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import load_table

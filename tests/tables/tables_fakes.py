@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlgs.config import RESULTS_VERSION
+from vlgs.identity import RESULTS_VERSION
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import Row, Table
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from tables_fakes import fake_runs
 
-from vlgs.config import RESULTS_VERSION
+from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.fill import Cell, Filled, Place, fill

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +158,17 @@ def test_rows_are_judged_in_pairs(tmp_path: Path):
     want = scipys_tau([55, 60, 64, 61], [40, 50, 45, 48])
     assert order_agreement(filled, "miou") == pytest.approx(want)
     assert f"{want:+.2f}" in text
+
+
+def test_the_order_in_which_runs_are_read_moves_no_interval(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    filled = filled_of(tmp_path)
+    spread = [n._replace(value=n.value + rng.normal()) for n in filled.numbers]
+    one, other = (
+        paired_differences(replace(filled, numbers=numbers), "miou")
+        for numbers in (spread, spread[::-1])
+    )
+    assert [(d.low, d.high) for d in other] == [(d.low, d.high) for d in one]
 
 
 def test_a_group_on_other_data_is_compared_with_its_own_full_model(tmp_path: Path):

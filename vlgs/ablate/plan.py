@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vlgs.config import Identity, quote_override
+from vlgs.config import quote_override
+from vlgs.identity import Identity
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import Table
 

@@ -7,9 +7,12 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from vlgs.config import CONF, check_config, check_targets, instantiate, run_id
+from vlgs.config import CONF, check_config, check_targets, instantiate
+from vlgs.former import adopt
+from vlgs.identity import run_id
+from vlgs.known import options
 from vlgs.module.build import Parts, build_module
 from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions, fit
@@ -43,9 +46,7 @@ def composed(overrides: Sequence[str]) -> DictConfig:
 
 def raster_presets() -> dict[str, RasterConfig]:
     """Every option of the group ``raster``, most exact first."""
-    found = {
-        path.stem: instantiate(OmegaConf.load(path)) for path in (CONF / "raster").glob("*.yaml")
-    }
+    found = {name: instantiate(composed([f"raster={name}"]).raster) for name in options("raster")}
     return dict(sorted(found.items(), key=lambda item: item[1].transmittance_min))
 
 
@@ -66,7 +67,7 @@ def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
         "fingerprint": scene.fingerprint,
     }
     folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint))
-    folder.path.mkdir(parents=True, exist_ok=True)
+    adopt(folder, config, scene.fingerprint)
     with folder.writing() as own:
         write_config(own.config, config)
         if fit(module, own, FitOptions(meta)) is not None:

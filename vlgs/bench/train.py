@@ -22,7 +22,8 @@ from vlgs.bench.sheet import (
     write_figure,
     write_sheet,
 )
-from vlgs.config import instantiate, run_id
+from vlgs.config import instantiate
+from vlgs.identity import run_id
 from vlgs.module.fit import FitOptions, fit
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS, turn

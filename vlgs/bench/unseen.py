@@ -15,7 +15,8 @@ from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.quality import score
 from vlgs.bench.sheet import provenance, read_sheet, say, show, write_sheet
 from vlgs.bench.unseen_draw import draw_unseen
-from vlgs.config import RESULTS_VERSION, instantiate, run_id
+from vlgs.config import instantiate
+from vlgs.identity import RESULTS_VERSION, run_id
 from vlgs.module.fit import FitOptions, fit
 from vlgs.report.provenance import commit
 from vlgs.runs import RunFolder

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vlgs.config import RESULTS_VERSION
+from vlgs.identity import RESULTS_VERSION
 from vlgs.module.checkpoint import Checkpoint
 from vlgs.module.lightning import VLGSModule
 

@@ -12,15 +12,17 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.config import (
-    CONF,
-    NOT_PART_OF_A_RUN,
+from vlgs.config import CONF
+from vlgs.files import write_atomically, write_changed
+from vlgs.identity import (
+    AS_WITHOUT,
+    MOVES_NOTHING,
     PLACES,
     RESULTS_VERSION,
     Identity,
     identity,
+    moves,
 )
-from vlgs.files import write_atomically, write_changed
 from vlgs.tables.registry import briefly, read_yaml
 
 log = logging.getLogger(__name__)
@@ -201,8 +203,9 @@ def _is_row(content: Any) -> bool:
 
 
 def _tree_digest() -> str:
-    """Content of the configuration folder and version of what results mean."""
-    digest = hashlib.sha256(str(RESULTS_VERSION).encode())
+    """Content of the configuration folder, what of it counts, and version of what results mean."""
+    counts = (RESULTS_VERSION, sorted(MOVES_NOTHING), sorted(AS_WITHOUT.items()), sorted(PLACES))
+    digest = hashlib.sha256(repr(counts).encode())
     for path in sorted(CONF.rglob("*.yaml")):
         digest.update(str(path.relative_to(CONF)).encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
@@ -220,7 +223,4 @@ def _compose(overrides: list[str]) -> DictConfig:
 def _moves(override: str) -> bool:
     """Whether an override can move a number."""
     key = override.partition("=")[0].lstrip("+~")
-    top, _, inner = key.partition(".")
-    if top == "data":
-        return inner not in PLACES
-    return top not in NOT_PART_OF_A_RUN
+    return moves(key) and key not in {f"data.{name}" for name in PLACES}

@@ -8,9 +8,10 @@ from typing import Any
 
 from rich.cells import cell_len
 
-from vlgs.config import CONF, NOT_PART_OF_A_RUN, PLACES
+from vlgs.config import CONF
 from vlgs.files import write_atomically
 from vlgs.finished import read_finished
+from vlgs.identity import PLACES, moves
 from vlgs.runs import RunFolder
 from vlgs.tables.registry import read_yaml
 from vlgs.text import csv_line, markdown, screen, to_bytes, visible
@@ -153,10 +154,10 @@ def _options(folder: RunFolder, metrics: Mapping[str, Any]) -> dict[str, str]:
     if not isinstance(content, dict):
         return options
     data = content.get("data")
-    kept = {key: value for key, value in content.items() if key not in NOT_PART_OF_A_RUN}
+    kept = {key: value for key, value in content.items() if key != "data"}
     if isinstance(data, dict):
         kept["data"] = {k: v for k, v in data.items() if k not in (*PLACES, "_target_")}
-    return options | {key: _shown(key, value) for key, value in _leaves(kept, "")}
+    return options | {k: _shown(k, value) for k, value in _leaves(kept, "") if moves(k)}
 
 
 def _leaves(node: Any, key: str, depth: int = 0) -> Iterable[tuple[str, Any]]:

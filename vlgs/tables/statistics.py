@@ -53,7 +53,7 @@ def paired_differences(filled: Filled, metric: str) -> list[Difference]:
             continue
         mine, full = numbers.get(index, {}), numbers.get(reference, {})
         pairs: dict[str, list[float]] = {}
-        for (column, seed), value in mine.items():
+        for (column, seed), value in sorted(mine.items()):  # in whatever order runs are read
             if (column, seed) in full:
                 pairs.setdefault(column, []).append(value - full[column, seed])
         if not pairs:

@@ -4,8 +4,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from vlgs.config import RESULTS_VERSION
 from vlgs.files import write_changed
+from vlgs.identity import RESULTS_VERSION
 from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import (

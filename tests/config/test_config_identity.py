@@ -1,0 +1,239 @@
+"""What the id of a run is a hash of: options by their names and values that can move a number, and nothing else."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+from tiny_runs import composed
+
+from vlgs.identity import AS_WITHOUT, MOVES_NOTHING, PLACES, identity, moves, run_id
+from vlgs.known import CONF, groups, is_group, last, nodes, option, options, targets
+
+MOVING_NOTHING = (
+    *("results", "progress", "pictures", "on_existing", "threads", "plugins", "logger.loggers"),
+    *("codec.cache_dir", "data.cache", "data.cache_bytes", "data.allow_missing_masks"),
+    *("raster.memory_budget", "trainer.checkpoint_every", "trainer.log_every"),
+    *(f"augment.extractor.{part}.pretrained.{key}" for part in ("segmenter", "encoder") for key in ("device", "weights")),
+)  # fmt: skip
+"""Beside ``features``, all of which stands in `augment` too. Written out again: what joins these in `vlgs.identity` joins here, with a test
+that it moves nothing."""
+
+NAMES = {
+    "augment": "none offline",
+    "blend": "beta fixed gaussian none uniform",
+    "codec": "autoencoder identity",
+    "data": "colmap synthetic",
+    "encoder": "clip maps",
+    "fusion": "cross mlp none self",
+    "gaussians": "default",
+    "indicator": "fixed learned opacity per_level",
+    "loss": "default",
+    "protocol": "auto dense lerf_ovs mipnerf360_goi ovs3d_argmax ovs3d_threshold select3d",
+    "query": "lerf_relevancy vocab_softmax",
+    "raster": "default",
+    "segmenter": "sam superpixels",
+    "sharing": "pos_cov",
+    "text": "clip vocabulary",
+    "trainer": "base",
+}
+"""What classes are called in ids. A name that changes orphans every run that has it."""
+
+IDS = {
+    "data.scene=mirrors": ("f6f83e32f15b45b4", "99d8cde4f4803be1", "bca9eee803a5ac58"),
+    "levels=joint indicator=per_level fusion=none trainer=paper": (
+        "17c0ba2aa7441e2a",
+        "7c33df2765de0765",
+        "bca9eee803a5ac58",
+    ),
+    "data=colmap data.root=here codec=identity sharing=pos protocol=lerf_ovs_v2": (
+        "cbf2231b856ab97f",
+        "11f318e48e5049a8",
+        "7fa5eb265910cece",
+    ),
+}
+"""Overrides -> run id for a content called f, recipe, data recipe. Where numbers change too, `RESULTS_VERSION` is raised and these are
+written anew; else a change of one orphans every run that there is."""
+
+
+@pytest.fixture(scope="module")
+def every_option() -> list[DictConfig]:
+    """Configurations that between them have every option of a run."""
+    chosen = {group: options(group) for group in groups() if group.partition("/")[0] != "features"}
+    chosen |= {"data": ["synthetic", "colmap"], "logger": ["csv"]}
+    found = []
+    for index in range(max(map(len, chosen.values()))):
+        picked = [f"{group}={names[index % len(names)]}" for group, names in chosen.items()]
+        if "augment=offline_sam" in picked:
+            parts = ("sam", "clip") if index < 3 else ("superpixels", "maps")
+            picked += [f"features/{kind}={part}" for kind, part in zip(("segmenter", "encoder"), parts, strict=True)]  # fmt: skip
+            picked += ["features.extractor.encoder.folder=maps"] * ("maps" in parts)
+        picked += ["data.root=here"] if "data=colmap" in picked else []
+        plain: Any = OmegaConf.to_container(composed(*picked), resolve=True)
+        found.append(OmegaConf.create(plain))
+    return found
+
+
+def ids(config: DictConfig) -> tuple[object, ...]:
+    return run_id(config, "f"), identity(config)
+
+
+def leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    for name, child in node.items():
+        full = f"{key}.{name}".lstrip(".")
+        if isinstance(child, dict) and child:
+            yield from leaves(child, full)
+        else:
+            yield full, child
+
+
+def other(value: Any) -> Any:
+    """Another value, whatever it was."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, list):
+        return [*value, "another"]
+    return 1 if value is None else value + 1 if isinstance(value, int | float) else f"{value}_"
+
+
+def test_every_value_that_can_move_a_number_moves_the_id_and_no_other_does(
+    every_option: list[DictConfig],
+):
+    seen, still = set(), set()
+    for config in every_option:
+        plain: Any = OmegaConf.to_container(config)
+        before = ids(config)
+        for key, value in leaves(plain):
+            group = plain[key.partition(".")[0]]
+            once = (key, group.get("_target_") if isinstance(group, dict) else None)
+            if once in seen or last(key) == "_partial_":
+                continue
+            seen.add(once)
+            OmegaConf.update(config, key, other(value))
+            if ids(config) == before:
+                still.add(key)
+            OmegaConf.update(config, key, value)
+    assert len(seen) > 300
+    assert {key for key in still if not key.startswith("features.")} == {
+        *MOVING_NOTHING,
+        *(f"data.{name}" for name in PLACES),
+    }
+    assert {key for key, _ in seen if not moves(key)} == still - {f"data.{n}" for n in PLACES}
+
+
+def test_what_moves_nothing_and_what_may_be_left_out_are_keys_that_are_there(
+    every_option: list[DictConfig],
+):
+    keys = {key for config in every_option for key, _ in leaves(OmegaConf.to_container(config))}
+    for name in (*MOVES_NOTHING - {"hydra"}, *AS_WITHOUT):
+        assert any(key == name or key.startswith(f"{name}.") for key in keys), name
+
+
+@pytest.mark.parametrize("key", ["gaussians.background", "trainer.skip.finite_check"])
+def test_a_key_changes_no_id_where_it_has_the_value_that_is_as_without(key: str):
+    plain: Any = OmegaConf.to_container(composed(f"{key}=0"), resolve=True)
+    without: Any = OmegaConf.create(plain)
+    above, _, name = key.rpartition(".")
+    del OmegaConf.select(without, above)[name]
+    given: Any = OmegaConf.create(plain)
+    want = ids(given)
+    assert ids(without) == want
+    OmegaConf.update(without, key, 1, force_add=True)
+    assert ids(without) != want
+
+
+def test_ids_stay():
+    for overrides, want in IDS.items():
+        config = composed(*overrides.split())
+        assert (run_id(config, "f"), identity(config).recipe, identity(config).data) == want
+
+
+def test_names_of_classes_stay(every_option: list[DictConfig]):
+    found: dict[str, set[str]] = {}
+    for config in every_option:
+        for key, node in nodes(OmegaConf.to_container(config, resolve=True)):
+            if "_target_" in node and moves(key) and is_group(key):
+                found.setdefault(last(key), set()).add(str(option(key, node["_target_"])))
+            elif "_target_" in node and moves(key):
+                # What has no name is told by its key alone.
+                assert len(targets(last(key)) - {"???"}) == 1, key
+    assert found == {group: set(names.split()) for group, names in NAMES.items()}
+
+
+def test_where_a_class_lies_and_what_it_is_called_change_no_id(tmp_path: Path):
+    package = Path(__file__).parents[2] / "vlgs"
+    shutil.copytree(
+        package, tmp_path / "vlgs", ignore=shutil.ignore_patterns("*.so", "__pycache__", "conf")
+    )
+    shutil.copytree(CONF, tmp_path / "conf")
+    chosen = [
+        "fusion=mlp",
+        "fusion=none codec=identity blend=none",
+        "augment=offline_sam features/encoder=dinov2",
+    ]
+    code = f"""if True:
+        import json, sys
+        from vlgs.command import composed
+        from vlgs.identity import identity, run_id
+        configs = [composed(overrides.split()) for overrides in {chosen}]
+        print(json.dumps([[run_id(c, "f"), identity(c).recipe, identity(c).data, c.fusion._target_] for c in configs]))
+    """
+
+    def told() -> list[list[str]]:
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return json.loads(done.stdout)
+
+    before = told()
+    for path in (tmp_path / "conf").rglob("*.yaml"):
+        text = path.read_text()
+        moved = re.sub(r"(_target_: )vlgs\.([\w.]+)\.(\w+)", r"\1vlgs.elsewhere.\2.New\3", text)
+        path.write_text(moved if "hydra" not in path.parts else text)
+    after = told()
+    assert [row[:3] for row in after] == [row[:3] for row in before]
+    assert after[0][3] == "vlgs.elsewhere.fusion.mlp.NewMLP"
+
+
+def test_what_the_command_line_puts_in_place_of_a_class_is_no_option_but_its_own():
+    named = ids(composed("fusion=cross"))
+    assert (
+        ids(composed("fusion=self", "fusion._target_=vlgs.fusion.attention.CrossAttention"))
+        == named
+    )
+    foreign = {
+        ids(composed(f"fusion={name}", "fusion._target_=my_lab.Gated"))
+        for name in ("self", "cross")
+    }
+    assert len(foreign) == 1  # the same keys, the same class
+    assert not foreign & {named, ids(composed("fusion=self"))}
+    inner = ids(composed("gaussians.densify._target_=my_lab.Densify"))
+    assert inner != ids(composed())
+
+
+def test_one_and_one_point_zero_are_one_run():
+    assert ids(composed("blend=fixed", "blend.value=1")) == ids(
+        composed("blend=fixed", "blend.value=1.0")
+    )
+    assert ids(composed("raster=fast")) == ids(composed("raster.transmittance_min=0.01"))
+
+
+def test_an_option_of_a_folder_of_ones_own_has_its_name_unless_ours_has_it(tmp_path: Path):
+    (tmp_path / "fusion").mkdir()
+    for name, target in (("gated", "my_lab.Gated"), ("self", "my_lab.Self")):
+        (tmp_path / "fusion" / f"{name}.yaml").write_text(f"_target_: {target}\n")
+    assert option("fusion", "my_lab.Gated", [tmp_path]) == "gated"
+    assert option("fusion", "my_lab.Self", [tmp_path]) is None
+    (tmp_path / "fusion" / "wide.yaml").write_text("_target_: my_lab.Gated\n")
+    with pytest.raises(
+        ValueError, match=r"named by one file.*gated\.yaml and wide\.yaml.*defaults: \[gated"
+    ):
+        option("fusion", "my_lab.Gated", [tmp_path])

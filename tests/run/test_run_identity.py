@@ -1,0 +1,103 @@
+"""Runs that are one run: with settings that move nothing, of a class that was moved, in a folder named by an older rule."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from safetensors.numpy import load_file
+from tiny_runs import TINY, composed
+
+from vlgs.former import former_id
+from vlgs.prepare import prepare
+from vlgs.run import run
+from vlgs.runs import RunFolder
+
+SHORT = (
+    *(*TINY, "trainer=smoke", "trainer.iterations=9", "trainer.checkpoint_every=3"),
+    *("pictures=false", "threads=1", "codec.training.steps=5", "data.width=24", "data.height=18"),
+    *("data.train_views=3", "data.test_views=1", "data.points=60", "protocol=dense"),
+)
+MEASURED = ("seconds", "fps", "bytes", "machine", "skips", "commit")
+"""Words in the names of metrics that are another in every run."""
+
+
+def only_run(results: Path) -> RunFolder:
+    (path,) = (results / "runs").iterdir()
+    return RunFolder(path)
+
+
+def made(folder: RunFolder) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Its metrics, without times and sizes in memory, and the bits of its last checkpoint."""
+    metrics = folder.finished() or {}
+    kept = {k: v for k, v in metrics.items() if not any(word in k for word in MEASURED)}
+    tensors = load_file(sorted(folder.checkpoint.glob("*.safetensors"))[-1])
+    return kept, {name: tensor.tobytes() for name, tensor in tensors.items()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A finished run."""
+    results = tmp_path_factory.mktemp("whole")
+    assert run(composed(*SHORT, f"results={results}")) == 0
+    return only_run(results)
+
+
+def test_settings_that_are_no_part_of_an_id_move_nothing(whole: RunFolder, tmp_path: Path):
+    others = (
+        *("trainer.log_every=2", "trainer.checkpoint_every=4", "raster.memory_budget=100000000"),
+        *("data.cache=null", f"codec.cache_dir={tmp_path}/codec", "threads=2", "progress=true"),
+        *("pictures=true", "on_existing=refuse", f"results={tmp_path}/elsewhere"),
+    )
+    assert run(composed(*SHORT, *others)) == 0
+    again = only_run(tmp_path / "elsewhere")
+    assert again.path.name == whole.path.name
+    assert made(again) == made(whole)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_folder_with_its_former_name_is_gone_on_with(
+    whole: RunFolder, tmp_path: Path, finished: bool, capfd: pytest.CaptureFixture[str]
+):
+    config = composed(*SHORT, f"results={tmp_path}")
+    former = RunFolder(tmp_path / "runs" / former_id(config, prepare(config).content))
+    shutil.copytree(whole.path, former.path)
+    metrics = {**(whole.finished() or {}), "config_hash": former.path.name, "recipe": "a", "data_recipe": "b"}  # fmt: skip
+    former.metrics.write_text(json.dumps(metrics))
+    if not finished:
+        former.metrics.unlink()
+    written = sorted(former.checkpoint.iterdir())[-1].stat().st_mtime_ns
+    assert run(config) == 0
+    folder = only_run(tmp_path)
+    assert folder.path.name == whole.path.name
+    assert made(folder) == made(whole)
+    assert sorted(folder.checkpoint.iterdir())[-1].stat().st_mtime_ns == written  # nothing trained
+    assert ("already done" in capfd.readouterr().out) == finished
+
+
+def test_a_plugin_whose_class_is_moved_has_its_run(tmp_path: Path):
+    options, lab = tmp_path / "options" / "fusion", tmp_path / "my_lab"
+    options.mkdir(parents=True)
+    lab.mkdir()
+    (lab / "__init__.py").touch()
+
+    def command(module: str) -> str:
+        (options / "gated.yaml").write_text(f"_target_: my_lab.{module}.Gated\n")
+        (lab / f"{module}.py").write_text("from vlgs.fusion.none import NoFusion\n\nclass Gated(NoFusion):\n    pass\n")  # fmt: skip
+        done = subprocess.run(
+            [
+                *(sys.executable, "-m", "vlgs.run", f"--config-dir={tmp_path}/options", "fusion=gated"),
+                *("plugins=[my_lab]", f"results={tmp_path}/results", *SHORT),
+            ],
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}:{Path.cwd()}"}, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "already done" not in command("gate")
+    (lab / "gate.py").unlink()
+    assert "already done" in command("moved")

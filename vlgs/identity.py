@@ -1,0 +1,171 @@
+"""Which run a configuration is: the id that names its folder, and the recipe that makes it a row of a table. Imports no torch.
+
+Hashed is what can move a number, as it would stand on a command line: ``fusion=self``, ``fusion.width=4``, ``seed=0``, the content of the
+data and `RESULTS_VERSION`.
+
+- Of a class its option counts: the one file of `conf/<group>`, or of the folder of ``--config-dir``, that names the class. Classes
+  can be moved and renamed. ``raster=fast`` and ``raster.transmittance_min=0.01`` are one run, since both files construct one class.
+- A class that stands in no such file, as in ``fusion._target_=my_lab.Gated``, counts by its path.
+- A part that is no group (``gaussians.densify``) counts by its values: only one class of ours can stand there.
+- Every value counts that is not in `MOVES_NOTHING`. Defaults count like values that are given, so that a default can change
+  without two different runs sharing an id. 1 and 1.0 are the same.
+- A key that is new, or goes, changes no id where it has the value in `AS_WITHOUT`.
+
+Renaming a group, an option or a key does change ids: rows of results/ have to be carried over then.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from vlgs.known import is_group, join, last, option, targets
+
+RESULTS_VERSION = 4
+"""Part of every run id; raised by a change that can move a number."""
+
+_MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
+
+MOVES_NOTHING = frozenset(
+    {
+        "codec.cache_dir",
+        "data.allow_missing_masks",  # refuses a scene, or does nothing
+        "data.cache",
+        "data.cache_bytes",
+        "features",  # what it says stands in `augment` too
+        "hydra",
+        "logger",
+        "on_existing",
+        "pictures",
+        "plugins",
+        "progress",
+        "raster.memory_budget",  # refuses a view, or does nothing
+        "results",
+        "threads",
+        "trainer.checkpoint_every",
+        "trainer.log_every",
+        *(f"{part}.pretrained.{key}" for part in _MAPS for key in ("device", "weights")),
+    }
+)
+"""Keys that cannot move a number, with all that is below them. Switches of `vlgs.skips` are not among them, though some of them move
+no bit: what they move is the time that table `skips` compares."""
+
+PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "scene"})
+"""Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
+
+GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
+"""Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
+
+AS_WITHOUT: Mapping[str, Any] = {
+    "gaussians.background": 0,
+    "trainer.skip.finite_check": False,
+    "trainer.skip.fuse_visible": False,
+}
+"""Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while
+they have; the default may be another. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""
+
+    recipe: str
+    """Hash of the configuration without data and seed."""
+    data: str
+    """Hash of how the data is read, wherever it lies and whichever scene it is."""
+    seed: int
+
+
+def run_id(config: DictConfig, fingerprint: str) -> str:
+    """Hash of all that can move a number; `fingerprint` stands for the content of the data, wherever it lies."""
+    plain = _plain(config)
+    del plain["data"]
+    return _digest(_without_files(plain) | {"data": fingerprint})
+
+
+def identity(config: DictConfig) -> Identity:
+    """What tells runs of a table apart; see `Identity`."""
+    plain = _plain(config)
+    data, seed = plain.pop("data"), plain.pop("seed")
+    given = {".".join(key): (plain.get(key[0]) or {}).get(key[1]) for key in GIVEN_FILES}
+    names = {key: Path(str(path)).name for key, path in given.items() if path is not None}
+    read = {key: value for key, value in data.items() if key not in PLACES}
+    return Identity(_digest(_without_files(plain) | names), _digest(_counted(read, "data")), seed)
+
+
+def moves(key: str) -> bool:
+    """Whether a dotted key can move a number.
+
+    Example:
+        >>> moves("trainer.iterations"), moves("trainer.log_every"), moves("logger.loggers")
+        (True, False, False)
+    """
+    names = key.split(".")
+    return not any(".".join(names[: n + 1]) in MOVES_NOTHING for n in range(len(names)))
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def _without_files(plain: Mapping[str, Any]) -> dict[str, Any]:
+    files = {".".join(key) for key in GIVEN_FILES}
+    return {key: value for key, value in _counted(plain).items() if key not in files}
+
+
+def _counted(node: Any, key: str = "") -> dict[str, Any]:
+    """Dotted keys and values of what can move a number; a class stands as its option at its own key."""
+    leaves = dict(_leaves(node, key))
+    return {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
+
+
+def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if key in MOVES_NOTHING:
+        return
+    if not isinstance(node, Mapping):
+        yield key, _value(node, key)
+        return
+    if "_target_" in node:
+        yield from _class(key, str(node["_target_"]))
+    for name, child in node.items():
+        if not str(name).startswith("_"):
+            yield from _leaves(child, join(key, name))
+
+
+def _class(key: str, target: str) -> Iterator[tuple[str, str]]:
+    """What a class counts by; nothing where no other class of ours can stand."""
+    name = option(key, target, _own_folders())
+    if name is not None:
+        yield key, name
+    elif is_group(key) or target not in targets(last(key)):
+        yield join(key, "_target_"), target
+
+
+def _value(node: Any, key: str) -> Any:
+    """A value that is no mapping, with one spelling of each number."""
+    if isinstance(node, list):
+        return [_counted(i, key) if isinstance(i, Mapping) else _value(i, key) for i in node]
+    return int(node) if isinstance(node, float) and node.is_integer() else node
+
+
+def _own_folders() -> list[Path]:
+    """Folders of the user's own options on the command line of this process."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if not HydraConfig.initialized():
+        return []
+    sources = HydraConfig.get().runtime.config_sources
+    return [Path(source.path) for source in sources if source.provider == "command-line"]
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    text = json.dumps(
+        {**content, "results_version": RESULTS_VERSION}, sort_keys=True, separators=(",", ":")
+    )
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
