@@ -62,8 +62,8 @@ GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
-    "trainer.skip.finite_check": False,
-    "trainer.skip.fuse_visible": False,
+    "trainer.exposure": False,
+    "trainer.learning_rates.exposure": 1e-3,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while
 they have; the default may be another. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""

@@ -81,11 +81,6 @@ SKIPS: tuple[Skip, ...] = (
         "3DGS; the bound: tests/README.md, N10",
     ),
     Skip(
-        "fuse_visible", "trainer.skip.fuse_visible", True, False, "off", "exact", "<= 1e-6",
-        "Gaussians outside all views of an iteration are not fused.",
-        "the fusion of a Gaussian depends on itself alone (Eq. 5)",
-    ),
-    Skip(
         "blend_zero", "trainer.skip.blend_weight", 0.0, -1.0, "on", "exact", "same bits",
         "The blended view is not rendered where lambda * SSIM(I1, I2) is 0.",
         "Eq. 11, SSIM clamped at 0",
@@ -106,11 +101,6 @@ SKIPS: tuple[Skip, ...] = (
         "frozen_weights", "trainer.skip.frozen_weights", True, False, "on", "exact", "<= 1e-6",
         "With frozen geometry (trainer.freeze) lists and blending weights of a view are kept, and a render is a sparse product.",
         "LangSplat trains features on frozen 3DGS; the rest is vlgs",
-    ),
-    Skip(
-        "finite_check", "trainer.skip.finite_check", True, False, "off", "exact", "same bits",
-        "Gradients are not looked through for what is not finite; a broken run is noticed by its loss, a step later.",
-        "vlgs",
     ),
     _always(
         "culling", "same bits",
@@ -175,8 +165,8 @@ def turn(names: Iterable[str], on: bool) -> tuple[str, ...]:
         ValueError: If two of them want different values of one key.
 
     Example:
-        >>> turn(["tile_test", "finite_check"], on=True)
-        ('raster.tile_test=true', 'trainer.skip.finite_check=true')
+        >>> turn(["tile_test", "frozen_weights"], on=True)
+        ('raster.tile_test=true', 'trainer.skip.frozen_weights=true')
     """
     chosen: dict[str, str] = {}
     for skip in map(named, names):

@@ -21,9 +21,8 @@ from vlgs.gaussians.parameters import with_language_shape
 from vlgs.module.build import Parts, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
-from vlgs.render.frustum import may_see
 from vlgs.runs import RunFolder
-from vlgs.types import Camera, Gaussians, Scene, Shape
+from vlgs.types import Camera, Scene, Shape
 
 CAMERA = Camera(
     torch.eye(4).double(), torch.tensor([[30.0, 0, 17], [0, 33, 15], [0, 0, 1]]).double(), 37, 29
@@ -130,19 +129,6 @@ def test_a_broken_shape_is_named(backend: str):
     t["own_scales"][2, 1] = float("nan")
     with pytest.raises(ValueError, match=r"shape.*row 2|row 2.*own shape"):
         render(t, backend)
-
-
-def test_what_language_alone_reaches_may_be_seen():
-    far = torch.tensor([[3.0, 0.0, 2.0]])
-    small, large = torch.full((1, 3), 0.01), torch.full((1, 3), 2.0)
-    one = torch.ones(1)
-    gaussians = Gaussians(
-        far, torch.eye(4)[:1], small, one, one, torch.zeros(1, 3), torch.zeros(1, 0, 3), far
-    )
-    camera = replace(CAMERA, viewmat=torch.eye(4), K=CAMERA.K.float())
-    assert not may_see(gaussians, camera, RasterConfig()).any()
-    both = replace(gaussians, language_shape=Shape(torch.eye(4)[:1], large))
-    assert may_see(both, camera, RasterConfig()).all()
 
 
 def params_of(scales: list[float], language: list[float]) -> torch.nn.ParameterDict:

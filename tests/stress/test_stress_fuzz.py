@@ -69,14 +69,6 @@ def test_a_shape_of_its_own_is_drawn_and_refused_by_name():
     assert message.endswith("of a group's own shape")
 
 
-def test_what_is_drawn_beyond_what_may_be_seen_is_a_failure(monkeypatch: pytest.MonkeyPatch):
-    def blind(gaussians, *rest):
-        return torch.zeros(len(gaussians.means), dtype=torch.bool)
-
-    monkeypatch.setattr(fuzz, "may_see", blind)
-    assert "drawn that none may see" in str(fuzz.fuzz(range(20)))
-
-
 @pytest.mark.parametrize(
     ("answer", "caught"),
     [(ValueError("went wrong"), "error without a name"), (RuntimeError("x"), "RuntimeError: x")],

@@ -72,7 +72,6 @@ NO_GRADIENT = {
     "vlgs.gaussians.parameters.with_level_indicators": "placed once",
     "vlgs.gaussians.sound.broken_rows": "a mask",
     "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
-    "vlgs.render.frustum.may_see": "a mask",
     "vlgs.render.model.ViewRender.detach": "takes the gradient away",
     "vlgs.render.level.LevelModel.fuse": "for questions: a level of what SplatModel.fuse gives",
     "vlgs.render.level.LevelModel.render": "SplatModel.render",

@@ -14,8 +14,7 @@ from torch import Tensor
 from vlgs.bench.fuzz_layers import run_frozen, run_layers
 from vlgs.bench.fuzz_scene import POISON, FuzzScene, make_scene
 from vlgs.render import rasterize
-from vlgs.render.frustum import may_see
-from vlgs.types import Camera, Gaussians, Rendered, Shape
+from vlgs.types import Rendered
 
 NAMED = re.compile(r"^[A-Za-z]\w*: .+ must be .+, got ", re.DOTALL)
 """``<who>: <what> must be <expected>, got <actual>``."""
@@ -59,7 +58,6 @@ def run_scene(scene: FuzzScene) -> str | None:
         _require(bool(NAMED.match(str(error))), f"error without a name: {error}")
         _require(not scene.tame, f"a tame scene was refused: {error}")
         return str(error)
-    _require(not (out.visible & ~_may_see(scene)).any(), "a Gaussian was drawn that none may see")
     # A frozen view also refuses values of Gaussians out of sight, which the rasterizer never reads.
     if scene.tensors["values0"].isfinite().all() and scene.shape_of[0] is None:
         run_frozen(scene.tensors, scene.width, scene.height, scene.config, out.images[0])
@@ -126,22 +124,6 @@ def _differentiate(scene: FuzzScene, asked: Iterable[str], used: Iterable[int]) 
         _require(gradient.shape == leaf.shape, f"gradient of {name} has shape {gradient.shape}")
         _require(bool(gradient.isfinite().all()), f"gradient of {name} is not finite")
     return out
-
-
-def _may_see(scene: FuzzScene) -> Tensor:
-    """Rows that `vlgs.render.frustum.may_see` lets through, with every shape of the scene."""
-    t = scene.tensors
-    n, camera = len(t["means"]), Camera(t["viewmat"], t["K"], scene.width, scene.height)
-    nothing = t["means"].new_zeros(n)
-    seen = torch.zeros(n, dtype=torch.bool)
-    for k in set(scene.shape_of):
-        own = None if k is None else Shape(t[f"shape{k}.quats"], t[f"shape{k}.scales"])
-        gaussians = Gaussians(
-            t["means"], t["quats"], t["scales"], nothing, nothing, t["means"],
-            nothing.new_zeros(n, 0, 3), t["means"], own,
-        )  # fmt: skip
-        seen |= may_see(gaussians, camera, scene.config)
-    return seen
 
 
 def _require(holds: bool, otherwise: str) -> None:

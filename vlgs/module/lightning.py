@@ -1,7 +1,6 @@
 """Training as one LightningModule: parameters, the step of Eq. 12, one Adam."""
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from statistics import fmean
@@ -13,7 +12,6 @@ from torch import Tensor, nn
 
 from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
-from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
@@ -147,7 +145,7 @@ class VLGSModule(L.LightningModule):
         pair = self.sampler.pair(step)
         first, second = targets = self.target(pair[0]), self.target(pair[1])
         plan = None if pair[0] == pair[1] else self._plan_blend(step, first, second)
-        fused = self._fuse(targets, plan)
+        fused = self.model.fuse()
         renders = [self._render(i, t, fused) for i, t in zip(pair, targets, strict=True)]
         renders = [self._exposed(i, render) for i, render in zip(pair, renders, strict=True)]
         color_losses = [self._color_loss(r, t) for r, t in zip(renders, targets, strict=True)]
@@ -164,8 +162,7 @@ class VLGSModule(L.LightningModule):
             self.screen_gradients = self._backward(total, color_losses, renders)
         else:  # nothing that is trained is in view, or neither view has a mask
             self.screen_gradients = tuple(torch.zeros_like(r.mean2d) for r in renders)
-        if not self.settings.skip.finite_check:
-            self._refuse_non_finite(where)
+        self._refuse_non_finite(where)
         self.optimizer.step()
         self.next_step = step + 1
         mse = self._color_mse(color_losses, renders, targets)
@@ -237,16 +234,6 @@ class VLGSModule(L.LightningModule):
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.gaussians_config.init is not None or "shN" in self.settings.freeze
         self.model.sh_degree = highest if trained else min(highest, step // self.settings.sh_every)
-
-    def _fuse(self, targets: tuple[Target, ...], plan: BlendPlan | None) -> FusedGaussians:
-        if not self.settings.skip.fuse_visible or isinstance(self.model.fusion, NoFusion):
-            return self.model.fuse()
-        cameras = [target.view.camera for target in targets]
-        started = time.perf_counter()
-        fused = self.model.fuse(cameras if plan is None else [*cameras, plan.camera])
-        self.skips.add("fusion", fused.rows, time.perf_counter() - started)
-        self.skips.skip("fuse_visible", self.model.count - fused.rows)
-        return fused
 
     def _render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
         language = target.codes is not None or not self.color

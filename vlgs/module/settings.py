@@ -43,8 +43,6 @@ class LearningRates:
 class SkipConfig:
     """Work of an iteration that is left out; `vlgs.skips` says what each costs in accuracy."""
 
-    fuse_visible: bool = False
-    """Fuse only Gaussians that a view of the iteration may see."""
     blend_weight: float = 0.0
     """Blended views with lambda * SSIM(I1, I2) up to this are not rendered; negative: every one is."""
     blend_reuse: float = 0.0
@@ -53,8 +51,6 @@ class SkipConfig:
     """Keep the blending weights of every view when geometry and weights are frozen."""
     frozen_budget: int = 2 << 30
     """Bytes that the kept weights of all views may take together."""
-    finite_check: bool = False
-    """Leave out the search for gradients, logits and log-scales that are not finite."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.blend_reuse <= 0.5:

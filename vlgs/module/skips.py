@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 WORK = {
-    "fuse_visible": "fusion",
     "blend_zero": "blended render",
     "blend_small": "blended render",
     "blend_reuse": "blended render",

@@ -1,6 +1,5 @@
 """A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -13,7 +12,6 @@ from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import sh_to_rgb, view_color
 from vlgs.geometry import camera_center
 from vlgs.indicator import Indicator
-from vlgs.render.frustum import may_see
 from vlgs.render.rasterize import rasterize
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
@@ -29,8 +27,6 @@ class FusedGaussians:
     """u_4.. of Eq. 5; the codes of all mask levels side by side with ``levels=joint``."""
     language_weight: Float[Tensor, " n *levels"]
     """What blends language: l, o or a constant, as the indicator says (Eq. 6)."""
-    rows: int
-    """How many were fused; all, unless they were fused for some cameras alone."""
     level: int | None = None
     """Place of the mask level that `feature` and `language_weight` are of; None: all that the model has."""
 
@@ -99,27 +95,11 @@ class SplatModel(nn.Module):
         """The Gaussians in natural units."""
         return activate(self.splats)
 
-    def fuse(self, cameras: Sequence[Camera] | None = None) -> FusedGaussians:
-        """Activate and fuse all Gaussians; once per iteration, however many views are rendered.
-
-        Args:
-            cameras: The only ones that will be rendered from; Gaussians that none of them may see are left at zero, unfused.
-        """
+    def fuse(self) -> FusedGaussians:
+        """Activate and fuse all Gaussians; once per iteration, however many views are rendered."""
         gaussians = self.gaussians()
-        color, feature = sh_to_rgb(gaussians.sh0), gaussians.features
-        count = self.count
-        if cameras is None:
-            color, feature = self.fusion(color, feature)
-        else:
-            seen = torch.stack([may_see(gaussians, c, self.raster) for c in cameras]).any(dim=0)
-            rows = seen.nonzero()[:, 0]
-            count = len(rows)
-            some = self.fusion(color[rows], feature[rows])
-            color, feature = (
-                torch.zeros_like(whole).index_copy(0, rows, part)
-                for whole, part in zip((color, feature), some, strict=True)
-            )
-        return FusedGaussians(gaussians, color, feature, self.indicator(gaussians), count)
+        color, feature = self.fusion(sh_to_rgb(gaussians.sh0), gaussians.features)
+        return FusedGaussians(gaussians, color, feature, self.indicator(gaussians))
 
     def render(
         self,
