@@ -4,6 +4,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -14,8 +15,8 @@
 #include "frozen.h"
 #include "rasterizer.h"
 #include "squared_error.h"
+#include "ssim.h"
 #include "view_color.h"
-#include "window.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -246,32 +247,63 @@ void bind_view_color(nb::module_ &m) {
 }
 
 template <class T>
-void bind_filter(nb::module_ &m) {
+void bind_ssim(nb::module_ &m) {
+  using Valid = std::optional<Array<const bool, -1, -1>>;
+  using Taps = Array<const T, kTaps>;
+  using Floors = std::pair<double, double>;
+  const auto make = [](const Image<const T> &a, const Image<const T> &b, const Valid &valid, const Taps &taps,
+                       const Floors &floors) {
+    return Ssim<T>{int64_t(a.shape(0)),
+                   int64_t(a.shape(1)),
+                   int64_t(a.shape(2)),
+                   a.data(),
+                   b.data(),
+                   valid ? valid->data() : nullptr,
+                   taps.data(),
+                   T(floors.first),
+                   T(floors.second)};
+  };
   m.def(
-      "filter",
-      [](Image<const T> planes, Array<const T, kTaps> taps, Image<T> out, int threads) {
-        const Window<T> window{int64_t(planes.shape(0)),
-                               int64_t(planes.shape(1)),
-                               int64_t(planes.shape(2)),
-                               planes.data(),
-                               taps.data(),
-                               out.data()};
+      "ssim_map",
+      [make](Image<const T> a, Image<const T> b, Taps taps, Floors floors, Image<T> map, int threads) {
+        const auto s = make(a, b, {}, taps, floors);
         nb::gil_scoped_release unlocked;
-        filter<T>(window, threads);
+        ssim_map<T>(s, map.data(), threads);
       },
-      strict("planes"), strict("taps"), strict("out"), "threads"_a);
+      strict("a"), strict("b"), strict("taps"), "floors"_a, strict("map"), "threads"_a);
   m.def(
-      "similarity",
-      [](Image<const T> a, Image<const T> b, Array<const T, kTaps> taps, double luminance_floor,
-         double structure_floor, Image<T> out, int threads) {
-        const Similarity<T> s{
-            int64_t(a.shape(0)), int64_t(a.shape(1)), int64_t(a.shape(2)), a.data(),  b.data(),
-            taps.data(),         T(luminance_floor),  T(structure_floor),  out.data()};
+      "ssim_sums",
+      [make](Image<const T> a, Image<const T> b, Valid valid, Taps taps, Floors floors, int threads) {
+        const auto s = make(a, b, valid, taps, floors);
         nb::gil_scoped_release unlocked;
-        similarity<T>(s, threads);
+        const SsimSums total = ssim_sums<T>(s, threads);
+        return std::tuple(total.distance, total.dissimilarity, total.pixels);
       },
-      strict("a"), strict("b"), strict("taps"), "luminance_floor"_a, "structure_floor"_a, strict("out"),
-      "threads"_a);
+      strict("a"), strict("b"), strict("valid").none(), strict("taps"), "floors"_a, "threads"_a);
+  const auto backward = [](const Ssim<T> &s, const SsimGrads<T> &d, int threads) {
+    nb::gil_scoped_release unlocked;
+    ssim_backward<T>(s, d, threads);
+  };
+  m.def(
+      "ssim_map_backward",
+      [make, backward](Image<const T> a, Image<const T> b, Taps taps, Floors floors, Image<const T> d_map,
+                       Image<T> d_a, std::optional<Image<T>> d_b, int threads) {
+        backward(make(a, b, {}, taps, floors), {d_map.data(), 0, 0, d_a.data(), d_b ? d_b->data() : nullptr},
+                 threads);
+      },
+      strict("a"), strict("b"), strict("taps"), "floors"_a, strict("d_map"), strict("d_a"),
+      strict("d_b").none(), "threads"_a);
+  m.def(
+      "ssim_sums_backward",
+      [make, backward](Image<const T> a, Image<const T> b, Valid valid, Taps taps, Floors floors,
+                       double d_distance, double d_dissimilarity, Image<T> d_a, std::optional<Image<T>> d_b,
+                       int threads) {
+        backward(make(a, b, valid, taps, floors),
+                 {nullptr, T(-d_dissimilarity), T(d_distance), d_a.data(), d_b ? d_b->data() : nullptr},
+                 threads);
+      },
+      strict("a"), strict("b"), strict("valid").none(), strict("taps"), "floors"_a, "d_distance"_a,
+      "d_dissimilarity"_a, strict("d_a"), strict("d_b").none(), "threads"_a);
 }
 
 template <class T>
@@ -382,8 +414,8 @@ NB_MODULE(_csrc, m) {
   bind_attention<double>(m);
   bind_view_color<float>(m);
   bind_view_color<double>(m);
-  bind_filter<float>(m);
-  bind_filter<double>(m);
+  bind_ssim<float>(m);
+  bind_ssim<double>(m);
   bind_squared_error<float>(m);
   bind_squared_error<double>(m);
   bind_frozen<float>(m, "FrozenFloat");

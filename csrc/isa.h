@@ -36,12 +36,16 @@ void attention_backward(const Attention<T> &, Fused<const T *> d_out, Fused<T *>
                         int64_t end, T *scratch, AttentionLayers<T *> sums);
 template <class T>
 T multiply_add(int64_t rounds, T factor, T addend);
-int64_t window_scratch(int64_t width);
 template <class T>
-void filter_plane(const Window<T> &, int64_t plane, T *scratch);
-int64_t similarity_scratch(int64_t width);
+int64_t ssim_scratch(const Ssim<T> &);
 template <class T>
-void similarity_plane(const Similarity<T> &, int64_t channel, T *scratch);
+void ssim_map_rows(const Ssim<T> &, T *map, int64_t begin, int64_t end, T *scratch);
+template <class T>
+void ssim_sum_rows(const Ssim<T> &, SsimSums *, int64_t begin, int64_t end, T *scratch);
+template <class T>
+int64_t ssim_backward_scratch(const Ssim<T> &);
+template <class T>
+void ssim_backward_rows(const Ssim<T> &, const SsimGrads<T> &, int64_t begin, int64_t end, T *scratch);
 template <class T>
 ErrorSum squared_error_chunk(const SquaredError<T> &, int64_t begin, int64_t end);
 template <class T>

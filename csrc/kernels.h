@@ -11,7 +11,7 @@
 
 #include "attention.h"
 #include "squared_error.h"
-#include "window.h"
+#include "ssim.h"
 
 namespace vlgs {
 
@@ -196,11 +196,12 @@ struct Kernels {
   // A yardstick: `rounds` times kYardstick multiply-adds of 16 lanes, none of which waits for another of its
   // round.
   T (*multiply_add)(int64_t rounds, T factor, T addend);
-  // One plane, one channel; with scratch as large as its *_scratch says for a width.
-  int64_t (*window_scratch)(int64_t width);
-  void (*filter_plane)(const Window<T> &, int64_t plane, T *scratch);
-  int64_t (*similarity_scratch)(int64_t width);
-  void (*similarity_plane)(const Similarity<T> &, int64_t channel, T *scratch);
+  // Rows [begin, end), all channels; with scratch as large as the *_scratch of its direction says.
+  int64_t (*ssim_scratch)(const Ssim<T> &);
+  void (*ssim_map)(const Ssim<T> &, T *map, int64_t begin, int64_t end, T *scratch);
+  void (*ssim_sums)(const Ssim<T> &, SsimSums *of_rows, int64_t begin, int64_t end, T *scratch);
+  int64_t (*ssim_backward_scratch)(const Ssim<T> &);
+  void (*ssim_backward)(const Ssim<T> &, const SsimGrads<T> &, int64_t begin, int64_t end, T *scratch);
   // Pixels [begin, end), few enough for sums in T.
   ErrorSum (*squared_error)(const SquaredError<T> &, int64_t begin, int64_t end);
   void (*squared_error_backward)(const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end);

@@ -1,27 +1,10 @@
 #include "squared_error.h"
 
-#include <cstring>
-
 #include "isa.h"
 #include "simd.h"
+#include "stretches.h"
 
 namespace vlgs::VLGS_ISA_NS {
-namespace {
-
-// Calls with every stretch of pixels in [begin, end) that count or do not; masks are made of long ones.
-template <class Call>
-VLGS_INLINE void for_stretches(const bool *valid, int64_t begin, int64_t end, Call call) {
-  if (!valid) return call(begin, end, true);
-  while (begin < end) {
-    const void *other = std::memchr(valid + begin, !valid[begin], size_t(end - begin));
-    const int64_t stop = other ? static_cast<const bool *>(other) - valid : end;
-    call(begin, stop, valid[begin]);
-    begin = stop;
-  }
-}
-
-}  // namespace
-
 template <class T>
 ErrorSum squared_error_chunk(const SquaredError<T> &e, int64_t begin, int64_t end) {
   Pack<T> sums = splat(T(0));

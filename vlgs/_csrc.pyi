@@ -139,14 +139,39 @@ def view_color_backward(
     d_means: Tensor,
     threads: int,
 ) -> None: ...
-def filter(planes: Tensor, taps: Tensor, out: Tensor, threads: int) -> None: ...
-def similarity(
+def ssim_map(
+    a: Tensor, b: Tensor, taps: Tensor, floors: tuple[float, float], map: Tensor, threads: int
+) -> None: ...
+def ssim_map_backward(
     a: Tensor,
     b: Tensor,
     taps: Tensor,
-    luminance_floor: float,
-    structure_floor: float,
-    out: Tensor,
+    floors: tuple[float, float],
+    d_map: Tensor,
+    d_a: Tensor,
+    d_b: Tensor | None,
+    threads: int,
+) -> None: ...
+def ssim_sums(
+    a: Tensor,
+    b: Tensor,
+    valid: Tensor | None,
+    taps: Tensor,
+    floors: tuple[float, float],
+    threads: int,
+) -> tuple[float, float, int]:
+    """Sums of |a - b| and of 1 - similarity over the pixels that count, and the number of these."""
+
+def ssim_sums_backward(
+    a: Tensor,
+    b: Tensor,
+    valid: Tensor | None,
+    taps: Tensor,
+    floors: tuple[float, float],
+    d_distance: float,
+    d_dissimilarity: float,
+    d_a: Tensor,
+    d_b: Tensor | None,
     threads: int,
 ) -> None: ...
 def squared_error(a: Tensor, b: Tensor, valid: Tensor | None, threads: int) -> tuple[float, int]:

@@ -110,18 +110,8 @@ def ssim_map(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tens
     rounding, equal images give exactly 1, and four moments are filtered instead of five.
     """
     _require_shapes("ssim", a, b)
-    if a.numel() == 0:
-        raise ValueError(f"ssim: images must have pixels, got shape {tuple(a.shape)}")
-    if not (torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)):
-        return _similarity(a, b)
-    total, gap = (a + b).permute(2, 0, 1), (a - b).permute(2, 0, 1)
-    moments = _filter(torch.cat([total, gap, total.square(), gap.square()]))
-    mean_p, mean_q, square_p, square_q = moments.chunk(4)
-    mean_p2, mean_q2 = mean_p.square(), mean_q.square()
-    var_p, var_q = (square_p - mean_p2).clamp_min(0), (square_q - mean_q2).clamp_min(0)
-    luminance = (mean_p2 - mean_q2 + 2 * SSIM_C1) / (mean_p2 + mean_q2 + 2 * SSIM_C1)
-    structure = (var_p - var_q + 2 * SSIM_C2) / (var_p + var_q + 2 * SSIM_C2)
-    return (luminance * structure).permute(1, 2, 0)
+    _require_pixels("ssim", a)
+    return cast(Tensor, _Ssim.apply(a, b))
 
 
 def l1_dssim(
@@ -134,15 +124,11 @@ def l1_dssim(
     With a mask, both means are over its pixels, and windows that reach beyond it see no difference there.
 
     Raises:
-        ValueError: If the shapes differ.
+        ValueError: If the shapes differ or the images have no pixels.
     """
     _require_shapes("l1_dssim", render, image, valid)
-    if valid is None:
-        return L1_SHARE * l1_loss(render, image) + (1 - L1_SHARE) * (1 - ssim(render, image))
-    image = image.masked_fill(~valid[..., None], 0)
-    render = torch.where(valid[..., None], render, image)
-    error = L1_SHARE * (render - image).abs() + (1 - L1_SHARE) * (1 - ssim_map(render, image))
-    return error.masked_fill(~valid[..., None], 0).sum() / _count(error, valid, "valid")
+    _require_pixels("l1_dssim", render)
+    return cast(Tensor, _L1Dssim.apply(render, image, valid))
 
 
 @torch.no_grad()
@@ -245,32 +231,58 @@ class _SquaredError(torch.autograd.Function):
         return d_render, -d_render if ctx.needs_input_grad[1] else None, None, None
 
 
-def _similarity(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
-    """`ssim_map` without a gradient, to the bit, in one pass; csrc/window.cpp."""
-    a, b = a.contiguous(), b.contiguous()
-    out = a.new_empty(a.shape[2], *a.shape[:2])
-    _csrc.similarity(a, b, _taps(a.dtype), 2 * SSIM_C1, 2 * SSIM_C2, out, torch.get_num_threads())
-    return out.permute(1, 2, 0)
-
-
-def _filter(planes: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
-    """Gaussian window over each plane, zeros beyond the edge."""
-    return cast(Tensor, _Filter.apply(planes))
-
-
-class _Filter(torch.autograd.Function):
-    """The window is symmetric, so that filtering is its own adjoint; csrc/window.cpp."""
+class _Ssim(torch.autograd.Function):
+    """`ssim_map`; csrc/ssim.cpp."""
 
     @staticmethod
-    def forward(ctx: Any, planes: Tensor) -> Tensor:
-        planes = planes.contiguous()
-        out = torch.empty_like(planes)
-        _csrc.filter(planes, _taps(planes.dtype), out, torch.get_num_threads())
-        return out
+    def forward(ctx: Any, a: Tensor, b: Tensor):
+        a, b = a.contiguous(), b.contiguous()
+        ctx.save_for_backward(a, b)
+        out = a.new_empty(a.shape[2], *a.shape[:2])
+        _csrc.ssim_map(a, b, _taps(a.dtype), _FLOORS, out, torch.get_num_threads())
+        return out.permute(1, 2, 0)
 
     @staticmethod
-    def backward(ctx: Any, d_out: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _filter(d_out)
+    @once_differentiable
+    def backward(ctx: Any, d_out: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        a, b = ctx.saved_tensors
+        d_out, taps, threads = d_out.contiguous(), _taps(a.dtype), torch.get_num_threads()
+        d_a, d_b = torch.empty_like(a), torch.empty_like(b) if ctx.needs_input_grad[1] else None
+        _csrc.ssim_map_backward(a, b, taps, _FLOORS, d_out, d_a, d_b, threads)
+        return d_a, d_b
+
+
+class _L1Dssim(torch.autograd.Function):
+    """`l1_dssim`; csrc/ssim.cpp."""
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, image: Tensor, valid: Tensor | None):
+        render, image = render.contiguous(), image.contiguous()
+        valid = None if valid is None else valid.contiguous()
+        ctx.save_for_backward(render, image, valid)
+        distance, dissimilarity, count = _csrc.ssim_sums(
+            render, image, valid, _taps(render.dtype), _FLOORS, torch.get_num_threads()
+        )
+        ctx.numbers = max(count * render.shape[-1], 1)
+        total = L1_SHARE * distance + (1 - L1_SHARE) * dissimilarity
+        return render.new_tensor(total / ctx.numbers)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_loss: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        render, image, valid = ctx.saved_tensors
+        d_render = torch.empty_like(render)
+        d_image = torch.empty_like(image) if ctx.needs_input_grad[1] else None
+        scale = d_loss.item() / ctx.numbers
+        _csrc.ssim_sums_backward(
+            render, image, valid, _taps(render.dtype), _FLOORS,
+            L1_SHARE * scale, (1 - L1_SHARE) * scale, d_render, d_image, torch.get_num_threads(),
+        )  # fmt: skip
+        return d_render, d_image, None
+
+
+_FLOORS = (2 * SSIM_C1, 2 * SSIM_C2)
+"""Of luminance and structure, for twice the moments (`ssim_map`)."""
 
 
 @cache
@@ -295,6 +307,11 @@ def _count(error: Tensor, valid: Tensor, pixels: Pixels) -> Tensor | int:
 def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ValueError(f"Losses: {name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _require_pixels(who: str, image: Tensor) -> None:
+    if image.numel() == 0:
+        raise ValueError(f"{who}: images must have pixels, got shape {tuple(image.shape)}")
 
 
 def _require_shapes(who: str, render: Tensor, target: Tensor, valid: Tensor | None = None) -> None:

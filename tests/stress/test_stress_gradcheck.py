@@ -31,7 +31,6 @@ from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_
 from vlgs.indicator import ColourOpacity, Learned, PerLevel
 from vlgs.losses import (
     Losses,
-    _filter,  # pyright: ignore[reportPrivateUsage]
     l1_dssim,
     masked_cosine,
     masked_l1,
@@ -238,8 +237,17 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.losses.masked_cosine": lambda: both(masked_cosine, VALID),
     "vlgs.losses.ssim": lambda: (ssim, [draw(*SIZE), draw(*SIZE, seed=1)]),
     "vlgs.losses.ssim_map": lambda: (ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),
-    "vlgs.losses.ssim_map, its window alone": lambda: (_filter, [draw(2, 13, 3)]),
+    "vlgs.losses.ssim_map of a column": lambda: (ssim_map, [draw(13, 1, 3), draw(13, 1, 3, seed=1)]),
+    **{
+        f"vlgs.losses.ssim_map of a row with {c} channels": lambda c=c: (
+            ssim_map, [draw(1, 7, c), draw(1, 7, c, seed=1)]
+        )
+        for c in (1, 3, 5)
+    },
     "vlgs.losses.l1_dssim": lambda: both(l1_dssim, VALID),
+    "vlgs.losses.l1_dssim by both images, without a mask": lambda: (
+        l1_dssim, [draw(*SIZE), 2 + draw(*SIZE, seed=1)]
+    ),
     "vlgs.losses.Losses.color_loss": lambda: (
         lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
     ),

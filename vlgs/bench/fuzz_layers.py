@@ -14,7 +14,7 @@ from torch import Tensor
 from vlgs import _csrc
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.gaussians.sh import view_color
-from vlgs.losses import masked_mse, ssim_map
+from vlgs.losses import l1_dssim, masked_mse, ssim_map
 from vlgs.render.frozen import FrozenView
 from vlgs.types import Camera, RasterConfig
 
@@ -39,7 +39,7 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
             not that of torch.
     """
     rng = np.random.default_rng([seed, 1])
-    for run in (_attention, _view_color, _window):
+    for run in (_attention, _view_color, _ssim):
         bad = float(rng.choice(poison)) if rng.random() < 0.25 else None
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
     _squared_error(rng, poison)
@@ -108,11 +108,12 @@ def _view_color(rng: np.random.Generator) -> Call:
     return lambda c, sh, m: (view_color(c, sh, m, eye, degree),), inputs
 
 
-def _window(rng: np.random.Generator) -> Call:
+def _ssim(rng: np.random.Generator) -> Call:
     dtype = _dtype(rng)
     shape = (*(int(rng.choice(SIDES)) for _ in "hw"), int(rng.integers(1, 4)))
     images = [torch.from_numpy(rng.random(shape)).to(dtype) for _ in "ab"]
-    return lambda a, b: (ssim_map(a, b),), images
+    valid = torch.from_numpy(rng.random(shape[:2]) < rng.choice([0.0, 0.5, 1.0]))
+    return lambda a, b: (ssim_map(a, b), l1_dssim(a, b), l1_dssim(a, b, valid)), images
 
 
 def _squared_error(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
