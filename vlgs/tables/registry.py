@@ -75,6 +75,8 @@ class Table:
     """Columns are the categories of a scene instead of scenes."""
     kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
     """Category -> ``translucent_reflective`` or ``other``."""
+    source: str = "sweeps"
+    """File that it was read from, for errors."""
 
     @property
     def runnable(self) -> tuple[Row, ...]:
@@ -157,6 +159,7 @@ def load_table(path: Path) -> Table:
         rows=rows,
         by_category=by_category,
         kinds=kinds,
+        source=where,
     )
 
 
