@@ -1,7 +1,6 @@
 """`python -m tests.fuzz [FAMILY...] [--count N] [--seed S] [--only NUMBER] [--write FILE]`: the table "tried, right"."""
 
 import argparse
-import csv
 import importlib
 import pkgutil
 import shutil
@@ -10,10 +9,10 @@ import time
 from pathlib import Path
 
 from tests import fuzz
+from tests.fuzz._table import FamilyRow, write_row
 from tests.fuzz.judge import Outcome, run_attack, scratch
+from vlgs.report.provenance import commit
 from vlgs.text import screen
-
-COLUMNS = ("family", "tried", "right", "slowest_cpu_s", "largest_mb", "wall_s")
 
 
 def families() -> list[str]:
@@ -54,9 +53,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--every", type=int, default=1, help="try each so many-th attack alone")
     parser.add_argument("--only", type=int, help="number of one attack to run again")
-    parser.add_argument("--write", type=Path, help="csv to write the table to")
+    parser.add_argument(
+        "--write", type=Path, help="csv with a row per family; those of other families stay"
+    )
     options = parser.parse_args()
-    rows, wrong = [], 0
+    wrong, code = 0, commit()  # before the attacks: it may change meanwhile
     for name in options.family or families():
         started = time.perf_counter()
         outcomes = run_family(name, options.seed, options.count, options.every, options.only)
@@ -65,24 +66,16 @@ def main() -> None:
         slowest = max((o.seconds for o in outcomes), default=0.0)
         largest = max((o.megabytes for o in outcomes), default=0.0)
         wall = time.perf_counter() - started
-        rows.append(
-            (
-                name,
-                len(outcomes),
-                len(outcomes) - len(bad),
-                f"{slowest:.1f}",
-                f"{largest:.0f}",
-                f"{wall:.0f}",
-            )
-        )
+        if options.write:
+            figures = round(slowest, 1), round(largest), round(wall)
+            tried = len(outcomes), len(outcomes) - len(bad)
+            row = FamilyRow(name, options.count, options.seed, *tried, *figures, code)
+            write_row(options.write, row)
         print(
             f"{name:<16} tried {len(outcomes):>5}  right {len(outcomes) - len(bad):>5}  {slowest:.1f} s CPU, {largest:.0f} MB at most"
         )
         for number, outcome in bad:
             print(screen(f"  --only {number}  {outcome.name}: {outcome.said}"))
-    if options.write:
-        with options.write.open("w", newline="") as file:
-            csv.writer(file).writerows([COLUMNS, *rows])
     sys.exit(1 if wrong else 0)
 
 
