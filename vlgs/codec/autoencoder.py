@@ -294,6 +294,8 @@ def _from_cache(path: Path) -> dict[str, Tensor]:
     Raises:
         ValueError: If the weights are not those that were written.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        raise ValueError("it is no file")
     with path.open("rb"):  # says why a file cannot be opened
         pass
     with safe_open(path, framework="pt") as file:

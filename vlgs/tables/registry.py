@@ -200,6 +200,8 @@ def read_yaml(path: Path) -> Any:
     Raises:
         ValueError: If it is none; the file is named.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        raise ValueError(f"{path}: must be a file, got a folder or a device")
     content = path.read_bytes()
     try:
         if sum(map(content.count, (b"[", b"{", b"- -", b"? ?"))) > DEEPEST:
