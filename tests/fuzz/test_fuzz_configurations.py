@@ -10,6 +10,7 @@ from vlgs.command import check_command
 REFUSED = {
     "trainer.iterations=0": "iterations must be 1 to 1e+09, got 0",
     "trainer.learning_rates.means=-1.0": "learning_rates: means must be 0 to 1, got -1.0",
+    "trainer.learning_rates.means=1e-320": "learning_rates: means must be 0 or 1e-30 to 1",
     "seed=18446744073709551616": "config: seed must be a whole number",
     "threads=100000": "config: threads must be 1 to 256, got 100000",
     "blend.alpha=nan": "blend: alpha must be a finite number, got nan",
@@ -27,6 +28,10 @@ AT_ONCE = {
     "data.root=x": "data=colmap or .* has it",
     "~fusion": "which takes fusion away",
     "+seed=1": "seed must be given without",
+    "+trainer=photos": "trainer must be given without +",
+    "trainer=smoke +trainer=photos": "trainer must be given without +",
+    "trainer@foo=photos": "options must be given as trainer=OPTION",
+    f"seed={'9' * 5000}": "command: seed must be a value that can be read",
     "data.root=a b[": "arguments must be KEY=VALUE",
     "fusion=null": "fusion must be one of",
     "-m fusion=none,mpl": "did you mean mlp?",

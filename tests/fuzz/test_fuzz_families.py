@@ -11,6 +11,7 @@ SAMPLES = {
     "files": ("--count", "40"),
     "bombs": ("--every", "12"),
     "paths": ("--count", "42"),
+    "places": ("--every", "16"),
     "text": ("--every", "7", "--count", "0"),
     "results": ("--every", "13", "--count", "0"),
 }

@@ -9,6 +9,9 @@ MOST_ITERATIONS = 10**9
 """A thousand times what anybody trains."""
 
 
+SMALLEST_RATE = 1e-30
+
+
 @dataclass(frozen=True)
 class LearningRates:
     """Adam's rates per parameter (tab:lr), 0 to 1; rates the paper does not give are marked. What has a rate of 0 does not learn."""
@@ -30,6 +33,13 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         require_range("learning_rates", 0, 1, **asdict(self))
+        for name, rate in asdict(self).items():
+            if (
+                0 < rate < SMALLEST_RATE
+            ):  # the decay between two rates would leave the range of floats
+                raise ValueError(
+                    f"learning_rates: {name} must be 0 or {SMALLEST_RATE:g} to 1, got {rate}"
+                )
 
     def of(self, parameter: str) -> float:
         """Rate of a parameter of the Gaussians; language's own shape is learned like colour's."""
