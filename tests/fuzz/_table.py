@@ -1,12 +1,14 @@
 """The table "tried, right" as a file: a row per family, under comments that say who measured."""
 
 import os
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
 from vlgs.bench.sheet import read_sheet, write_sheet
-from vlgs.report.provenance import machine
+from vlgs.report.provenance import PACKAGE, commit, machine
 
+CODE = ("vlgs", "csrc", "conf")
 COMMANDS = "python -m tests.fuzz FAMILY --count COUNT --seed SEED --write FILE"
 
 
@@ -24,8 +26,20 @@ class FamilyRow:
     largest_mb: float
     """Growth of the peak memory of a process."""
     wall_s: float
-    commit: str | None
+    commit: str
     """Of the code that was attacked."""
+
+
+def attacked() -> str:
+    """The last commit that changed what is attacked: of two that differ in tests and documents alone, the rows are those of one."""
+    found = subprocess.run(
+        ["git", "log", "-1", "--format=%H", "--", *CODE],
+        cwd=PACKAGE.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+    return f"{found}+dirty" if "+dirty" in str(commit()) else found
 
 
 def write_row(path: Path, row: FamilyRow) -> None:
