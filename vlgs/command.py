@@ -25,7 +25,7 @@ from vlgs.manual import describe
 from vlgs.targets import check_hydra, require_plugins
 
 _MOST_ENTRIES = 10_000
-"""Of a user's file of options; OmegaConf takes a millisecond for ten."""
+"""Of a user's file of options; none of ours has a hundred."""
 _REFUSED_FLAGS = {
     "experimental_rerun": "--experimental-rerun must not be given, as it runs what is pickled in a file",
     "config_path": "--config-path must not be given, as the configuration is that of vlgs; --config-dir=FOLDER adds options to it",
