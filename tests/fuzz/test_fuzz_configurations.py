@@ -53,3 +53,15 @@ def test_check_and_run_refuse_alike(line: str, tmp_path: Path, monkeypatch: pyte
     assert REFUSED[line] in ran.error
     assert checked.status == ran.status == 1
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "gone", "round", "n" * 300])
+def test_results_that_cannot_be_kept_are_refused_by_check_and_run(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "gone").symlink_to("nowhere/at/all")
+    (tmp_path / "round").symlink_to("round")
+    _, ran = both([*TINY, f"results={place}"], tmp_path / "results")
+    assert "config: results must be a folder that is there or can be made, got" in ran.error
