@@ -2,9 +2,10 @@
 
 import os
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tests.fuzz.judge import Outcome
 from vlgs.bench.sheet import read_sheet, write_sheet
 from vlgs.report.provenance import PACKAGE, commit, machine
 
@@ -20,14 +21,27 @@ class FamilyRow:
     count: int
     """As asked for; a family with a fixed list has its own."""
     seed: int
-    tried: int
-    right: int
-    slowest_cpu_s: float
-    largest_mb: float
-    """Growth of the peak memory of a process."""
-    wall_s: float
     commit: str
     """Of the code that was attacked."""
+    tried: int = 0
+    right: int = 0
+    whole: bool = False
+    """Whether all of them were tried; one that is not whole is gone on with by the same command on the same code."""
+    slowest_cpu_s: float = 0.0
+    largest_mb: float = 0.0
+    """Growth of the peak memory of a process."""
+    wall_s: float = 0.0
+
+    def plus(self, outcome: Outcome, wall: float) -> "FamilyRow":
+        """With one more attack."""
+        return replace(
+            self,
+            tried=self.tried + 1,
+            right=self.right + outcome.right,
+            slowest_cpu_s=max(self.slowest_cpu_s, round(outcome.seconds, 1)),
+            largest_mb=max(self.largest_mb, round(outcome.megabytes)),
+            wall_s=round(self.wall_s + wall, 2),
+        )
 
 
 def attacked() -> str:
@@ -42,14 +56,25 @@ def attacked() -> str:
     return f"{found}+dirty" if "+dirty" in str(commit()) else found
 
 
+def begun(path: Path | None, fresh: FamilyRow) -> FamilyRow:
+    """The row of an interrupted run of the same attacks on the same code, so far without a fault; else `fresh`."""
+    for row in _read(path) if path else ():
+        same = replace(fresh, tried=row.tried, right=row.tried) == replace(
+            row, slowest_cpu_s=0.0, largest_mb=0.0, wall_s=0.0
+        )
+        if same and "+dirty" not in row.commit:
+            return row
+    return fresh
+
+
 def write_row(path: Path, row: FamilyRow) -> None:
     """Add a row, or put it in the place of its family's; the rows of other families stay."""
-    found = read_sheet(path).to_dict("records") if path.is_file() else []
-    rows = [FamilyRow(**{str(k): v for k, v in line.items()}) for line in found]
-    rows = [*(other for other in rows if other.family != row.family), row]
-    header = {
-        "command": COMMANDS,
-        **machine(),
-        "load": f"{os.getloadavg()[0]:.2f} (one-minute average at the end)",
-    }
+    rows = [*(other for other in _read(path) if other.family != row.family), row]
+    load = f"{os.getloadavg()[0]:.2f} (one-minute average at the end)"
+    header = {"command": COMMANDS, **machine(), "load": load}
     write_sheet(path, sorted(rows, key=lambda line: line.family), header)
+
+
+def _read(path: Path) -> list[FamilyRow]:
+    lines = read_sheet(path).to_dict("records") if path.is_file() else []
+    return [FamilyRow(**{str(key): value for key, value in line.items()}) for line in lines]
