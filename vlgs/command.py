@@ -24,6 +24,8 @@ from vlgs.known import CONF, contents, groups, join, near, options, place
 from vlgs.manual import describe
 from vlgs.targets import check_hydra, require_plugins
 
+_MOST_ENTRIES = 10_000
+"""Of a user's file of options; none of ours has a hundred."""
 _REFUSED_FLAGS = {
     "experimental_rerun": "--experimental-rerun must not be given, as it runs what is pickled in a file",
     "config_path": "--config-path must not be given, as the configuration is that of vlgs; --config-dir=FOLDER adds options to it",
@@ -51,7 +53,7 @@ def check_command(arguments: Sequence[str], name: str = "config") -> None:
     if extra is not None:
         _check_folder(extra)
     overrides = _parse(given.overrides)
-    _check_overrides(overrides, extra)
+    _check_overrides(overrides, extra, name)
     for override in overrides:
         if override.is_sweep_override() and not given.multirun:
             raise ValueError(
@@ -77,7 +79,7 @@ def composed(overrides: Sequence[str], name: str = "config") -> DictConfig:
     Raises:
         ValueError: As `check_command`.
     """
-    _check_overrides(_parse(overrides), None)
+    _check_overrides(_parse(overrides), None, name)
     config = _compose(overrides, name, None, hydra=False)
     check_targets(config, name)
     return config
@@ -92,6 +94,9 @@ def _parse(overrides: Sequence[str]) -> list[Override]:
     for text in overrides:
         try:
             parsed.append(parser.parse_override(text))
+        except ValueError as error:  # of Python, about a number of thousands of digits
+            what = f"{text.partition('=')[0]} must be a value that can be read, got: {error}"
+            raise ValueError(f"command: {what}") from error
         except HydraException as error:  # of the parser, or of its lexer
             key, equals, value = text.partition("=")
             hint = (
@@ -103,14 +108,24 @@ def _parse(overrides: Sequence[str]) -> list[Override]:
     return parsed
 
 
-def _check_overrides(overrides: Sequence[Override], extra: Path | None) -> None:
+def _check_overrides(overrides: Sequence[Override], extra: Path | None, name: str) -> None:
     """Refuse options that do not exist and overrides that delete keys. Whether keys exist is checked after composing."""
+    chosen = {
+        next(iter(entry))
+        for entry in contents(CONF / f"{name}.yaml")["defaults"]
+        if isinstance(entry, dict)
+    }
     for override in overrides:
         key, said = override.key_or_group, override.input_line
         if override.type == OverrideType.DEL:
             raise ValueError(
                 f"command: keys must be given or left alone, got {said}, which takes {key} away"
             )
+        if override.package is not None:
+            raise ValueError(f"command: options must be given as {key}=OPTION, got {said}")
+        if key in chosen and override.type != OverrideType.CHANGE:
+            # Hydra keeps the option that the file or another argument has chosen, and says nothing.
+            raise ValueError(f"command: {key} must be given without +, got {said}")
         if key == "hydra.searchpath":
             raise ValueError(f"command: folders must be given as --config-dir=FOLDER, got {said}")
         known = _options(key, extra)
@@ -261,21 +276,40 @@ def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise ValueError(f"command: --config-dir must be a folder, got {folder}")
     for path in sorted((*folder.rglob("*.yaml"), *folder.rglob("*.yml"))):
-        text = path.read_text()
+        if not path.is_file():  # a pipe would be waited for without end
+            raise ValueError(f"{path}: must be a file, got a folder or a device")
         try:
+            text = path.read_text(encoding="utf-8")
             content = yaml.safe_load(text) or {}
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ValueError(
-                f"{path}: content must be YAML, got {error}".replace("\n", " ")
+                f"{path}: content must be YAML in UTF-8, got {error}".replace("\n", " ")
             ) from error
-        names = set(content) if isinstance(content, dict) else set()
+        if not isinstance(content, dict) or _entries(content) > _MOST_ENTRIES:
+            raise ValueError(
+                f"{path}: content must be keys and values, at most {_MOST_ENTRIES}, got something else or more"
+            )
+        names = set(content)
         header = [line for line in text.splitlines() if line.startswith("#") and "@package" in line]
-        defaults = str(content.get("defaults", "")) if isinstance(content, dict) else ""
+        defaults = str(content.get("defaults", ""))
         inside = "hydra" in path.relative_to(folder).parts
         if inside or names & {"hydra", "plugins"} or "hydra" in " ".join([*header, defaults]):
             raise ValueError(
                 f"{path}: options must leave hydra and plugins alone; give what is needed on the command line"
             )
+
+
+def _entries(content: Any) -> int:
+    """Values inside, those under an alias as often as it stands there, which a small file can do very often; stops where enough."""
+    count, waiting = 0, [content]
+    while waiting and count <= _MOST_ENTRIES:
+        node = waiting.pop()
+        inside = list(
+            node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+        )
+        count += len(inside)
+        waiting += inside
+    return count
 
 
 def _plain(node: Any) -> Any:

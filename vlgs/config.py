@@ -1,9 +1,11 @@
 """The configuration: where it lives and what it may construct. Imports no torch."""
 
 import inspect
+import os
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -12,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from vlgs import targets
 from vlgs.known import CONF as CONF
 from vlgs.known import is_ours, join, last, nodes, unread
+from vlgs.text import visible
 from vlgs.values import require_range, require_types
 
 LEVELS = (1, 2, 3)
@@ -95,6 +98,26 @@ def check_targets(
     targets.check_targets(plain, plain.get("plugins", []) if plugins is None else plugins)
 
 
+def _require_place(results: str) -> None:
+    """Do nothing if the folder is there or can be made, so that nobody waits for a run that cannot be kept."""
+    wanted = (
+        f"config: results must be a folder that is there or can be made, got {visible(results)}"
+    )
+    path = Path(results).absolute()
+    for place in (path, *path.parents):
+        try:
+            os.lstat(place)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{wanted}: {getattr(error, 'strerror', error)}") from error
+        if not place.is_dir():
+            raise ValueError(f"{wanted}: {visible(str(place))} is no folder")
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise ValueError(f"{wanted}: {visible(str(place))} may not be written to")
+        return
+
+
 def _unresolved(error: OmegaConfBaseException) -> ValueError:
     reason = str(error).strip().partition("\n")[0]
     return ValueError(f"config: {error.full_key} must have a value, got: {reason}")
@@ -116,6 +139,7 @@ def _check_root(config: DictConfig) -> None:
     require_range("config", 1, MOST_THREADS, threads=config.threads)
     if not config.results:
         raise ValueError("config: results must be a folder, got ''")
+    _require_place(config.results)
     loggers = config.logger.get("loggers")
     if not isinstance(loggers, ListConfig) or not all(
         isinstance(one, DictConfig) and "_target_" in one for one in loggers

@@ -1,10 +1,12 @@
-"""Writing files so that a crash or a full disk never leaves half of one."""
+"""Writing files and folders so that a crash or a full disk never leaves half of one."""
 
 import fcntl
 import os
 import re
 import secrets
-from contextlib import suppress
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -50,11 +52,33 @@ def write_changed(path: Path, data: bytes) -> None:
         write_atomically(path, data)
 
 
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A folder to fill, which becomes `path` when the context ends without an error: all of it, or nothing.
+
+    Args:
+        path: A folder that does not exist or is empty; the folders above it are made.
+
+    Raises:
+        OSError: If it cannot be made.
+    """
+    path = path.absolute()  # "." has no name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sweep(path.parent)
+    scratch, descriptor = _make_temporary(path)
+    try:
+        yield scratch
+        scratch.replace(path)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        os.close(descriptor)
+
+
 def sweep(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder.
 
-    Who writes a temporary file holds a lock on it, which dies with its process. Process numbers would not do: two containers that
-    share a disk count their processes apart.
+    Who writes a temporary file or folder holds a lock on it, which dies with its process. Process numbers would not do: two
+    containers that share a disk count their processes apart.
     """
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
@@ -68,11 +92,29 @@ def sweep_below(folder: Path) -> None:
         sweep(Path(inner))
 
 
+def _temporary(path: Path) -> Path:
+    """A new name beside `path`, as `sweep` knows it."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+
+
+def _make_temporary(path: Path) -> tuple[Path, int]:
+    """A new folder beside `path`, and the descriptor that holds its lock."""
+    while True:
+        scratch = _temporary(path)
+        scratch.mkdir()
+        with suppress(FileNotFoundError):  # swept before it could be opened
+            descriptor = os.open(scratch, os.O_RDONLY)
+            with suppress(OSError):  # on a disk without locks nobody can sweep either
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            if scratch.is_dir():
+                return scratch, descriptor
+            os.close(descriptor)  # swept between the two calls
+
+
 def _open_temporary(path: Path) -> BinaryIO:
     """A new file beside `path`, locked."""
     while True:
-        name = f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
-        file = path.with_name(name).open("xb")
+        file = _temporary(path).open("xb")
         with suppress(OSError):  # on a disk without locks nobody can sweep either
             fcntl.flock(file, fcntl.LOCK_EX)
         if os.fstat(file.fileno()).st_nlink:
@@ -81,6 +123,14 @@ def _open_temporary(path: Path) -> BinaryIO:
 
 
 def _remove_if_dead(path: Path) -> None:
-    with suppress(OSError), path.open("r+b") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        path.unlink()
+    with suppress(OSError):
+        folder = path.is_dir() and not path.is_symlink()
+        descriptor = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if folder:
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        finally:
+            os.close(descriptor)

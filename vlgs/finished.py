@@ -37,6 +37,8 @@ def read_finished(path: Path) -> dict[str, Any]:
         ValueError: Names the file, the entry, what it must be and what to do.
         OSError: If the file cannot be read.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        raise ValueError(f"{path}: must be a file, got a folder or a device; {REMEDY}")
     try:
         content = json.loads(path.read_bytes().decode())
     except RecursionError:

@@ -181,6 +181,10 @@ def _report(
     if asked and asked.note:
         query = asked.query
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
+    if config.levels == "separate" and len(models) > 1:
+        first, *_, last = scenes
+        whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
+        evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
     cameras, language = [v.camera for v in scene.test or scene.train], len(scene.mask_vectors) > 0
     timing = measure_fps(model, cameras, query, prompts, language)
     if config.pictures:

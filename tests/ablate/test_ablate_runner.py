@@ -160,6 +160,21 @@ def test_ctrl_c_lets_the_runs_save_and_the_same_command_goes_on(table: Table, tm
     assert ablate(request_of(table, results)) == 0
 
 
+def test_logs_of_jobs_name_no_folder_of_this_machine(
+    table: Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "Jane Doe").mkdir()
+    monkeypatch.chdir(tmp_path / "Jane Doe")
+    assert ablate(request_of(table, Path("r"))) == 0
+    logs = [path for path in Path("r/logs").rglob("*") if path.is_file()]
+    assert len(logs) >= 4
+    for path in logs:
+        assert str(tmp_path) not in path.read_text()
+    (log,) = (path for path in logs if path.name.startswith("0000_"))
+    assert log.read_text().startswith("python -m vlgs.run ")
+    assert "results=r " in log.read_text()
+
+
 def test_a_stop_reaches_jobs_that_have_not_begun(tmp_path: Path):
     (tmp_path / job.STOP).touch()
     run_and_record(tmp_path, 3, ["fusion=none"])

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -189,7 +190,7 @@ def test_cache_answers_with_the_same_bits(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(list(file.parent.iterdir())) == 2
 
 
-@pytest.mark.parametrize("damage", ["empty", "cut", "foreign"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "foreign", "bit", "unsigned"])
 def test_a_damaged_cache_is_fitted_again(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ):
@@ -199,7 +200,10 @@ def test_a_damaged_cache_is_fitted_again(
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
     foreign = whole.replace(b"decoder.0.weight", b"decoder.0.wheels")
-    file.write_bytes({"empty": b"", "cut": whole[:-9], "foreign": foreign}[damage])
+    flipped = whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:]  # the last bit of a weight
+    unsigned = save(load(whole))
+    damaged = {"empty": b"", "cut": whole[:-9], "foreign": foreign, "bit": flipped}
+    file.write_bytes(damaged.get(damage, unsigned))
     with caplog.at_level(logging.WARNING):
         again.fit(vectors, areas)
     assert "is not usable" in caplog.text

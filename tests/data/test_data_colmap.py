@@ -390,7 +390,8 @@ def test_two_images_of_one_stem_are_refused(tmp_path: Path):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(picture(0)).save(tmp_path / "images" / name)
     with pytest.raises(
-        SceneError, match=r"right/a\.png: image stems must be unique, got 'a' twice"
+        SceneError,
+        match=r"right/a\.png: image stems must be unique, got 'a' twice: also .*left/a\.png; rename it",
     ):
         load_scene(str(tmp_path))
 

@@ -1,5 +1,7 @@
 """A scene on disk is the scene that was written."""
 
+import os
+import signal
 from dataclasses import replace
 from typing import Any, cast
 
@@ -15,6 +17,8 @@ from vlgs.data import colmap
 from vlgs.data.export import write_scene
 from vlgs.data.export.outline import outlines
 from vlgs.data.labels.objects import crosses_itself, fill_polygons
+from vlgs.data.sparse import read_cameras
+from vlgs.data.sparse.write import write_colmap
 from vlgs.data.synthetic import Recipe, language_levels, load_scene
 from vlgs.types import ObjectLabels, View
 
@@ -54,6 +58,33 @@ def pieces_of(mask: np.ndarray) -> tuple[np.ndarray, int]:
 
 def held_out(scene) -> list[str]:
     return [view.name for view in scene.test]
+
+
+@pytest.mark.parametrize("kind", ["scene", "model"])
+def test_what_a_killed_process_left_goes_with_the_next_writing(
+    scene, folder, tmp_path, monkeypatch, kind: str
+):
+    out = tmp_path / "out"
+
+    def write():
+        if kind == "scene":
+            write_scene(scene, out)
+        else:
+            write_colmap(out, read_cameras(folder))
+
+    def die(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    child = os.fork()
+    if child == 0:
+        monkeypatch.setattr("vlgs.data.export.write_sparse", die)
+        monkeypatch.setattr("pycolmap.Reconstruction.write", die)
+        write()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    assert list(tmp_path.glob(".out*"))
+    write()
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_reading_gives_back_what_was_written(scene, folder):

@@ -73,6 +73,7 @@ def write_corpus(folder: Path) -> list[Honest]:
         "settings": (_settings, _read_settings, False),
         "processor": (_processor, _read_processor, True),
         "codec_cache": (_codec_cache, _fit_from_cache, True),
+        "photographs_cache": (_photograph_from_cache, _photograph_from_cache, True),
     }
     found = []
     for name, (write, read, names_itself) in units.items():
@@ -246,7 +247,7 @@ def _checkpoint(values: int) -> Callable[[Path], None]:
     return write
 
 
-def _codec(root: Path) -> Autoencoder:
+def _codec(root: Path | None) -> Autoencoder:
     training = AutoencoderTraining(steps=2, batch=2)
     return Autoencoder(
         encoder_widths=(6, 4), decoder_widths=(4, 6), training=training, cache_dir=root
@@ -258,10 +259,28 @@ def _codec_cache(root: Path) -> None:
 
 
 def _fit_from_cache(root: Path) -> None:
+    """Whatever the cache holds, the weights are those of a fit."""
     import torch
 
-    vectors = torch.eye(WIDE)
-    _codec(root).fit(vectors, torch.ones(WIDE))
+    found, fitted = _codec(root), _codec(None)
+    for codec in (found, fitted):
+        codec.fit(torch.eye(WIDE), torch.ones(WIDE))
+    wanted = fitted.state_dict()
+    assert all(torch.equal(value, wanted[key]) for key, value in found.state_dict().items())
+
+
+def _photograph_from_cache(root: Path) -> None:
+    """Whatever the cache holds, the photographs are those that were taken."""
+    import torch
+
+    from vlgs.data.synthetic import load_scene
+
+    found, traced = (
+        load_scene(width=16, height=16, train_views=2, test_views=1, points=20, cache=cache)
+        for cache in (str(root), None)
+    )
+    for one, other in zip(found.train, traced.train, strict=True):
+        assert torch.equal(one.read_image(), other.read_image())
 
 
 def _weights(root: Path) -> None:

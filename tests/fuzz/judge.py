@@ -19,7 +19,7 @@ from pathlib import Path
 
 SECONDS = 10.0
 ENDLESS = 300
-"""Seconds by the clock after which a child that waits for something is ended; a busy machine takes its time."""
+"""A busy machine takes its time."""
 MEGABYTES = 1000.0
 
 NAMED = re.compile(r"^(error: )?[^:\n]+: .+", re.DOTALL)
@@ -38,6 +38,8 @@ class Attack:
     """What an error must contain: the name of the file, the key."""
     must_refuse: bool = False
     """Whether taking it without an error is wrong."""
+    endless: int = ENDLESS
+    """Seconds by the clock after which a child that waits for something is ended."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def _judge(
 def _child(attack: Attack, out: int) -> None:
     """Attack and tell; never returns."""
     resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
-    signal.alarm(ENDLESS)
+    signal.alarm(attack.endless)
     with tempfile.TemporaryFile() as noise:
         os.dup2(noise.fileno(), sys.stdout.fileno())
         os.dup2(noise.fileno(), sys.stderr.fileno())

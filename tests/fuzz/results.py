@@ -10,6 +10,7 @@ from pathlib import Path
 import yaml
 
 from tests.fuzz.judge import Attack
+from tests.fuzz.places import KINDS, PATIENCE
 from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
@@ -34,6 +35,8 @@ METRICS = {
     "machine": {"cpu": "a cpu", "cores": 2}, "reasons": {"lpips": "no weights"}, "levels": [3], "level_models": "single",
     "skips": {"a": {"skipped": 9, "share": 0.5, "seconds_saved": None}}, "failure": None,
 }  # fmt: skip
+Content = bytes | Callable[[Path], None]
+"""What is put in a file's place."""
 ODD = (
     None,
     True,
@@ -69,24 +72,24 @@ def attacks(folder: Path, seed: int, count: int) -> Iterator[Attack]:
         for what, content in edits:
             number += 1
             call = partial(_damage, folder / "sound", folder / str(number), name, content, act)
-            yield Attack(f"{name}: {what}", call)
+            yield Attack(f"{name}: {what}", call, endless=PATIENCE)
 
 
 def _damage(
-    sound: Path, folder: Path, name: str, content: bytes | None, act: Callable[[Path], None]
+    sound: Path, folder: Path, name: str, content: Content, act: Callable[[Path], None]
 ) -> None:
     shutil.copytree(sound, folder)
     path = next(folder.glob(name))
     path.unlink()
-    if content is None:
-        path.mkdir()
-    else:
+    if isinstance(content, bytes):
         path.write_bytes(content)
+    else:
+        content(path)
     try:
         act(folder)
     except (ValueError, OSError) as error:
-        known = ("must hold", "must share a protocol")  # of all runs together, which it names
-        if str(path) not in str(error) and not any(words in str(error) for words in known):
+        named = path.parent if name.startswith("runs/") else path
+        if str(named) not in str(error) and "must hold" not in str(error):  # all runs, none is left
             raise AssertionError(f"does not name {path.name}: {error}") from error
         raise ValueError(
             f"tables: {error}"
@@ -117,7 +120,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "sweeps/tiny.yaml": _tables,
 }
 
-FIXED: tuple[tuple[str, bytes | None], ...] = (
+FIXED: tuple[tuple[str, Content], ...] = (
     ("empty", b""),
     ("{}", b"{}"),
     ("[]", b"[]"),
@@ -131,7 +134,7 @@ FIXED: tuple[tuple[str, bytes | None], ...] = (
     ("a long cell", b'"' + b"x" * 300_000),
     ("bomb", b"a: &a [x, x, x, x, x, x, x, x, x]\n" + b"".join(
         b"%c: &%c [%s]\n" % (c, c, b", ".join([b"*%c" % (c - 1)] * 9)) for c in range(ord("b"), ord("k")))),
-    ("a folder", None),
+    *KINDS.items(),
 )  # fmt: skip
 
 

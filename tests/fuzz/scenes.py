@@ -20,6 +20,8 @@ OPTIONS = (
     *("data=colmap", "data.every=3", "codec.cache_dir=null", "codec.training.steps=2", "threads=1"),
     *("trainer=smoke", "trainer.iterations=2", "progress=false", "pictures=false"),
 )
+PICTURES = ("pictures=true",)
+"""Of cases whose names go to the disk, and into pictures and tables."""
 
 
 @dataclass
@@ -148,6 +150,40 @@ def cases() -> list[Case]:
         Case("sharing none", sound, False, "", ("sharing=none", "fusion=none")),
         Case("lifted", sound, False, "", ("sharing=lifted", "fusion=none", "indicator=opacity")),
         Case("photographs augmented without an extractor", sound, True, "extractor", ("augment=offline",)),
+        Case("a class that a terminal obeys", _renamed("\x1b[31mcup\x07"), None, "", PICTURES),
+        Case("a class of two lines", _renamed("cup\n# table: 1"), None, "", PICTURES),
+        Case("a class that a table computes", _renamed("=cmd|' /C calc'!A0"), False, "", PICTURES),
+        Case("a class of markup", _renamed("[red]<script>\\write18{x}[/red]"), False, "", PICTURES),
+        Case("a class that leaves", _renamed("../../../cup"), False, "", PICTURES),
+        Case("a class of a blank", _renamed(" "), None, "", PICTURES),
+        Case("a class written from right to left", _renamed("\u202egnp.puc"), None, "", PICTURES),
+        Case("photographs of markup", _named("<b>{i}[red] %s"), False, "", PICTURES),
+        Case("photographs of a formula", _named("=1+{i}"), False, "", PICTURES),
+        Case("photographs that a terminal obeys", _named("\x1b[31m{i}"), None, "", PICTURES),
+        Case("photographs of long names", _named("n" * 240 + "{i}"), None, "", PICTURES),
+        Case("photographs of names in two cases", replace(sound, names=("a.png", "A.png", "b.png", "B.png")), None, "", PICTURES),
+        Case("a quaternion of zeros", _spoilt(lambda r: _pose(r, "0 0 0 0 0 0 3")), True, "images.txt"),
+        Case("a quaternion of 1e20", _spoilt(lambda r: _pose(r, "1e20 0 0 0 0 0 3")), None),
+        Case("a quaternion of 1e-30", _spoilt(lambda r: _pose(r, "1e-30 0 0 0 0 0 3")), None),
+        Case("a quaternion of 1e200", _spoilt(lambda r: _pose(r, "1e200 0 0 0 0 0 3")), None),
+        Case("a distortion of 1e9", _spoilt(lambda r: _camera(r, "OPENCV 32 24 30 30 16 12 1e9 0 0 0")), None),
+        Case("a distortion that folds", _spoilt(lambda r: _camera(r, "SIMPLE_RADIAL 32 24 30 16 12 -9")), None),
+        Case("a fisheye of 1e3", _spoilt(lambda r: _camera(r, "OPENCV_FISHEYE 32 24 30 30 16 12 1e3 -1e3 1e3 0")), None),
+        Case("a thin prism of 1e4", _spoilt(lambda r: _camera(r, "THIN_PRISM_FISHEYE 32 24 30 30 16 12 1 1 1 1 1 1 1e4 1e4")), None),
+        Case("a camera of a billion pixels", _spoilt(lambda r: _camera(r, "PINHOLE 40000 30000 30 30 16 12")), None),
+        Case("a camera turned by EXIF", _spoilt(_turn), None),
+        Case("photographs of 16 bits", _spoilt(lambda r: _deep(r)), None),
+        Case("photographs all black", _spoilt(lambda r: _paint(r, 0)), None),
+        Case("photographs all white", _spoilt(lambda r: _paint(r, 255)), None),
+        Case("one photograph is transparent", _spoilt(lambda r: _convert(r, 2, "RGBA")), False),
+        Case("one photograph has a palette", _spoilt(lambda r: _convert(r, 2, "P")), False),
+        Case("resized a hundredfold", sound, None, "", ("data.resize=100",)),
+        Case("resized ten thousandfold", sound, True, "resize", ("data.resize=10000",)),
+        Case("every view is held out", sound, None, "", ("data.split=llff", "data.every=1")),
+        Case("every is 0", sound, True, "every", ("data.split=llff", "data.every=0")),
+        Case("one view is held out twice", sound, None, "", ("data.split=list", "data.test=[frame_1,frame_1]")),
+        Case("all views are held out", sound, True, "", ("data.split=list", "data.test=[frame_0,frame_1,frame_2,frame_3,frame_4,frame_5]")),
+        Case("nobody is held out", sound, None, "", ("data.split=list", "data.test=[]")),
     ]  # fmt: skip
 
 
@@ -279,6 +315,39 @@ def _views(count: int) -> Odd:
 
 def _spoilt(spoil: Callable[[Path], object]) -> Odd:
     return replace(Odd(), spoil=spoil)
+
+
+def _named(pattern: str) -> Odd:
+    return replace(Odd(), names=tuple(f"{pattern.format(i=i)}.png" for i in range(6)))
+
+
+def _pose(root: Path, numbers: str) -> None:
+    path = root / "sparse" / "0" / "images.txt"
+    lines = path.read_text().split("\n")
+    lines[0] = f"1 {numbers} 1 {lines[0].split()[-1]}"
+    path.write_text("\n".join(lines))
+
+
+def _camera(root: Path, numbers: str) -> None:
+    (root / "sparse" / "0" / "cameras.txt").write_text(f"1 {numbers}\n")
+
+
+def _turn(root: Path) -> None:
+    image = Image.open(_photo(root, 2))
+    exif = image.getexif()
+    exif[0x0112] = 6
+    image.save(_photo(root, 2), exif=exif)
+
+
+def _deep(root: Path) -> None:
+    for number in range(6):
+        pixels = np.random.default_rng(number).integers(0, 65536, (24, 32), np.uint16)
+        Image.fromarray(pixels).save(_photo(root, number))
+
+
+def _paint(root: Path, value: int) -> None:
+    for number in range(6):
+        Image.new("RGB", (32, 24), (value,) * 3).save(_photo(root, number))
 
 
 def _renamed(name: str) -> Odd:

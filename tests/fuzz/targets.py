@@ -121,6 +121,11 @@ SMUGGLED = (
     ("--config-path=strange", "--config-name=evil"),
     ("--experimental-rerun=strange/config.pickle",),
     ("--config-dir=strange/globals", "+data=evil"),
+    ("--config-dir=strange/globals", "data=evil"),
+    *(
+        (f"--config-dir=strange/{kind}", "fusion=evil")
+        for kind in ("bomb", "nested", "latin", "list", "words", "pipe")
+    ),
     ("--config-dir=strange/logging", "hydra/job_logging=evil"),
     ("--config-dir=strange/plugins", "fusion=evil"),
     ("--config-dir=strange/quiet", "fusion=evil"),
@@ -187,6 +192,20 @@ def write_strangers(folder: Path) -> None:
         (folder / name).write_text(yaml.safe_dump(content))
     path = folder / "strange/globals/data/evil.yaml"
     path.write_text("# @package _global_\n" + path.read_text())
+    aliases = (b"%c: &%c [%s]\n" % (c, c, b", ".join([b"*%c" % (c - 1)] * 9)) for c in b"bcdefghij")
+    hostile = {
+        "bomb": b"_target_: vlgs.fusion.none.NoFusion\na: &a [x]\n" + b"".join(aliases),
+        "nested": b"a: " + b"[" * 100_000,
+        "latin": b"_target_: \xff\xfe",
+        "list": b"- a\n",
+        "words": b"a: b: c",
+    }
+    for name, data in hostile.items():
+        path = folder / "strange" / name / "fusion" / "evil.yaml"
+        path.parent.mkdir(parents=True)
+        path.write_bytes(data)
+    (folder / "strange/pipe/fusion").mkdir(parents=True)
+    os.mkfifo(folder / "strange/pipe/fusion/evil.yaml")
     (folder / "strange" / "config.pickle").write_bytes(b"cos\nsystem\n(S'touch canary'\ntR.")
 
 

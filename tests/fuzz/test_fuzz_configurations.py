@@ -10,6 +10,7 @@ from vlgs.command import check_command
 REFUSED = {
     "trainer.iterations=0": "iterations must be 1 to 1e+09, got 0",
     "trainer.learning_rates.means=-1.0": "learning_rates: means must be 0 to 1, got -1.0",
+    "trainer.learning_rates.means=1e-320": "learning_rates: means must be 0 or 1e-30 to 1",
     "seed=18446744073709551616": "config: seed must be a whole number",
     "threads=100000": "config: threads must be 1 to 256, got 100000",
     "blend.alpha=nan": "blend: alpha must be a finite number, got nan",
@@ -27,6 +28,10 @@ AT_ONCE = {
     "data.root=x": "data=colmap or .* has it",
     "~fusion": "which takes fusion away",
     "+seed=1": "seed must be given without",
+    "+trainer=photos": "trainer must be given without +",
+    "trainer=smoke +trainer=photos": "trainer must be given without +",
+    "trainer@foo=photos": "options must be given as trainer=OPTION",
+    f"seed={'9' * 5000}": "command: seed must be a value that can be read",
     "data.root=a b[": "arguments must be KEY=VALUE",
     "fusion=null": "fusion must be one of",
     "-m fusion=none,mpl": "did you mean mlp?",
@@ -48,3 +53,15 @@ def test_check_and_run_refuse_alike(line: str, tmp_path: Path, monkeypatch: pyte
     assert REFUSED[line] in ran.error
     assert checked.status == ran.status == 1
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "gone", "round", "n" * 300])
+def test_results_that_cannot_be_kept_are_refused_by_check_and_run(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "gone").symlink_to("nowhere/at/all")
+    (tmp_path / "round").symlink_to("round")
+    _, ran = both([*TINY, f"results={place}"], tmp_path / "results")
+    assert "config: results must be a folder that is there or can be made, got" in ran.error

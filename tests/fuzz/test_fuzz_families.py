@@ -3,14 +3,19 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from tests.fuzz._table import FamilyRow, begun, write_row
+from tests.fuzz.judge import Outcome
 
 SAMPLES = {
     "files": ("--count", "40"),
     "bombs": ("--every", "12"),
     "paths": ("--count", "42"),
+    "places": ("--every", "16"),
     "text": ("--every", "7", "--count", "0"),
     "results": ("--every", "13", "--count", "0"),
 }
@@ -25,3 +30,16 @@ def test_a_sample_of_the_attacks_is_met_rightly(family: str):
     assert done.returncode == 0, done.stdout + done.stderr
     tried, right = map(int, re.findall(r"tried +(\d+)  right +(\d+)", done.stdout)[0])
     assert tried == right > 10
+
+
+def test_a_family_is_gone_on_with_on_the_same_code_alone(tmp_path: Path):
+    fresh, path = FamilyRow("files", 100, 0, "abc"), tmp_path / "attacks.csv"
+    assert begun(path, fresh) == fresh
+    outcome = Outcome("cut", True, "", seconds=0.25, megabytes=3.0)
+    write_row(path, fresh.plus(outcome, wall=1.0))
+    write_row(path, FamilyRow("bombs", 100, 0, "abc", tried=2, right=1))
+    assert begun(path, fresh) == fresh.plus(outcome, wall=1.0)
+    for other in (replace(fresh, commit="abd"), replace(fresh, count=5), replace(fresh, seed=1)):
+        assert begun(path, other) == other
+    bombs = FamilyRow("bombs", 100, 0, "abc")
+    assert begun(path, bombs) == bombs  # what went wrong is tried again

@@ -8,6 +8,8 @@ from tests.fuzz import targets
 from vlgs.command import check_command
 
 SAMPLE = [
+    ("--config-dir=strange/bomb", "fusion=evil"),
+    ("--config-dir=strange/latin", "fusion=evil"),
     *((f"fusion._target_={target}",) for target in targets.DANGEROUS[::7]),
     *((f"{place}._target_=torch.load",) for place in targets.PLACES[::6]),
     *((f"fusion._target_={name}",) for name in targets.NO_NAMES[::4]),

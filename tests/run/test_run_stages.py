@@ -70,6 +70,9 @@ def test_every_model_has_a_folder_and_the_run_one_result(tmp_path: Path, kind: s
     queries = json.loads(folder.queries.read_text())
     assert {row["level"] for row in queries} <= {None, *range(len(metrics["levels"]))}
     assert (folder.renders / "overview.png").is_file() == config.pictures
+    of_which = "of the model of mask level 3, as are frame rates; psnr and ssim of that of 1"
+    told = of_which if config.levels == "separate" else None
+    assert metrics["reasons"].get("pictures") == told
 
 
 def test_stopped_anywhere_it_goes_on_to_the_same_bits(

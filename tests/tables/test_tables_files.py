@@ -229,10 +229,14 @@ def test_the_papers_categories_are_found_with_blanks(tmp_path: Path):
 def test_runs_that_must_not_stand_together_are_refused(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     runs = read_metrics(tmp_path)
-    with pytest.raises(ValueError, match="must be one, got"):
-        require_one_meaning(tidy(to_lines([*runs, runs[0] | {"config_hash": "twin"}])))
-    with pytest.raises(ValueError, match=r"must share a protocol, got dense@1/synthetic, dense@2"):
-        require_one_meaning(tidy(to_lines([*runs[1:], runs[0] | {"protocol": "dense@2"}])))
+    twins = f"must be one, got {tmp_path}/runs/{runs[0]['config_hash']}, twin of {tmp_path}/runs.csv, whose"
+    with pytest.raises(ValueError, match=twins):
+        require_one_meaning(tidy(to_lines([*runs, runs[0] | {"config_hash": "twin"}])), tmp_path)
+    protocols = rf"must share a protocol, got dense@1/synthetic, dense@2 in {tmp_path}/runs/"
+    with pytest.raises(ValueError, match=protocols):
+        require_one_meaning(
+            tidy(to_lines([*runs[1:], runs[0] | {"protocol": "dense@2"}])), tmp_path
+        )
 
 
 DAMAGED = {
@@ -285,8 +289,22 @@ def test_a_table_is_written_where_its_options_exist(table: Table, tmp_path: Path
     assert not (tmp_path / "photographs" / "faults.csv").exists()
 
     path.write_text(FAULTS.replace("missed", "mist"))
-    with pytest.raises(ValueError, match=r"data\.faults\.mist"):  # in no benchmark: a slip
+    slip = rf"{path}: rows\[0\]\.set must be options .*data\.faults\.mist"  # in no benchmark
+    with pytest.raises(ValueError, match=slip):
         write_all(tmp_path, [load_table(path)])
+
+
+def test_a_damaged_benchmark_is_named_though_another_has_the_rows(table: Table, tmp_path: Path):
+    for name in ("synthetic", "theirs"):
+        Benchmark(name, ("data=synthetic",), ("glassware",), (0,)).extend(
+            tmp_path / name / "benchmark.yaml"
+        )
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    write_all(tmp_path, [table])
+    damaged = tmp_path / "theirs" / "benchmark.yaml"
+    damaged.write_text(damaged.read_text().replace("data=", "dta="))
+    with pytest.raises(ValueError, match=rf"{damaged}: overrides must be options .*dta"):
+        write_all(tmp_path, [table])
 
 
 def test_the_report_has_its_pictures(table: Table, tmp_path: Path):

@@ -12,13 +12,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from vlgs.config import override_value, quote_override
 from vlgs.files import write_atomically
+from vlgs.places import without_places
 from vlgs.runs import BUSY, STOPPED, UNSCORED
 
 TAIL_LINES = 5
@@ -71,9 +73,10 @@ class Outcome:
 def read_outcome(folder: Path, number: int) -> Outcome:
     """The last state that the job of that number wrote."""
     try:
-        return Outcome(**json.loads(_record(folder, number).read_text()))
+        outcome = Outcome(**json.loads(_record(folder, number).read_text()))
     except FileNotFoundError:
         return Outcome()
+    return replace(outcome, log=str(folder / outcome.log))
 
 
 def run_job(config: DictConfig) -> None:
@@ -94,11 +97,12 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / f"{number:04d}_{_title(overrides)}.log"
-    command = [*RUN, *overrides, "progress=false"]
+    arguments = [*map(_from_here, overrides), "progress=false"]
+    command = [*RUN, *arguments]
     start, stop = time.time(), folder / STOP
 
     def record(status: int | None) -> None:
-        outcome = Outcome(status, time.time() - start, str(log))
+        outcome = Outcome(status, time.time() - start, log.name)
         write_atomically(_record(folder, number), json.dumps(asdict(outcome)).encode())
 
     if stop.exists():
@@ -106,7 +110,7 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
         return
     record(None)
     with log.open("w") as file:
-        file.write(shlex.join(command) + "\n")
+        file.write(shlex.join(["python", "-m", "vlgs.run", *without_places(arguments)]) + "\n")
         file.flush()
         # A session of its own: Ctrl-C in a terminal reaches it once, as the SIGTERM below, and it saves its step.
         with subprocess.Popen(
@@ -130,6 +134,15 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
                     process.terminate()
                     told = True
     record(process.returncode)
+
+
+def _from_here(override: str) -> str:
+    """The results folder said from the current one where it lies below it, so that what the run prints names no home."""
+    if not override.startswith("results="):
+        return override
+    place = Path(str(override_value(override)))
+    below = place.is_absolute() and place.is_relative_to(Path.cwd())
+    return quote_override("results", os.path.relpath(place)) if below else override
 
 
 def _record(folder: Path, number: int) -> Path:

@@ -51,7 +51,7 @@ def plan(
                 try:
                     key = composer.identity(row.overrides, seed)
                 except ValueError as error:
-                    raise ValueError(f"{title}: {error}") from error
+                    raise ValueError(f"{table.source}: {title}: {error}") from error
                 for scene in benchmark.scenes:
                     chosen = (quote_override("data.scene", scene),) if by_scene else ()
                     command = (*benchmark.overrides, *row.overrides, *chosen, f"seed={seed}")

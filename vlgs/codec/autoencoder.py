@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -21,8 +21,8 @@ from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
 
-FORMAT = "vlgs-autoencoder-3"
-"""Part of the cache key: a change of the code that moves the weights changes it."""
+FORMAT = "vlgs-autoencoder-4"
+"""Part of the cache key: a change of the code that moves the weights, or of the file, changes it."""
 CHECKS = 5
 """Times that the reconstruction is measured over the last fifth of the steps; the best weights stay."""
 WIDEST = 8192
@@ -151,7 +151,7 @@ class Autoencoder(nn.Module):
                 self._fit(vectors, areas)
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(path, save(self.state_dict()))
+                write_atomically(path, _to_cache(self.state_dict()))
         self.requires_grad_(False)
 
     def encode(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m d"]:
@@ -252,7 +252,7 @@ class Autoencoder(nn.Module):
 
     def _read_cache(self, path: Path, width: int) -> bool:
         try:
-            state = load(path.read_bytes())
+            state = _from_cache(path)
             first = state.get("encoder.0.weight", torch.empty(0))
             if first.shape != (self.encoder_widths[0], width):
                 raise ValueError(f"it must take vectors of {width}, got {list(first.shape)}")
@@ -265,6 +265,34 @@ class Autoencoder(nn.Module):
             log.warning("autoencoder: cache %s is not usable, fitting again: %s", path, error)
             return False
         return True
+
+
+def _to_cache(state: Mapping[str, Tensor]) -> bytes:
+    """A file of weights that holds its digest: without it a flipped bit would go into every result, unnoticed."""
+    return save(dict(state), {"digest": _digest(state)})
+
+
+def _from_cache(path: Path) -> dict[str, Tensor]:
+    """The inverse of `_to_cache`.
+
+    Raises:
+        ValueError: If the weights are not those that were written.
+    """
+    if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        raise ValueError("it is no file")
+    with path.open("rb"):  # says why a file cannot be opened
+        pass
+    with safe_open(path, framework="pt") as file:
+        digest = (file.metadata() or {}).get("digest")
+        state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no __iter__)
+    if digest != _digest(state):
+        raise ValueError("it does not match its digest")
+    return state
+
+
+def _digest(state: Mapping[str, Tensor]) -> str:
+    """Hash of names, types, shapes and values: safetensors sorts them, and without metadata equal weights are equal bytes."""
+    return hashlib.blake2b(save(dict(state)), digest_size=16).hexdigest()
 
 
 def _build_for_state(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:

@@ -75,13 +75,20 @@ def open_views(
             continue
         view = _make_view(image, camera, photograph, lenses[key], folder.cache)
         if view.name in views:
-            faults.append(Fault(str(path), f"image stems must be unique, got {view.name!r} twice"))
+            other = views[view.name].photograph.path
+            what = f"image stems must be unique, got {view.name!r} twice: also {other}"
+            faults.append(Fault(str(path), what, RENAME))
         views[view.name] = view
     if missing:
         what = f"registered images must all be there, got {len(missing)} of {len(sound)} missing"
         faults.append(Fault(str(folder.path), f"{what}: {listing(missing, 20)}"))
     # A camera that cannot be undistorted is one fault, however many images it took.
     return tuple(views.values()), tuple(dict.fromkeys(faults))
+
+
+RENAME = (
+    "rename it, in the COLMAP model too: labels and language maps find their photograph by its stem"
+)
 
 
 def scale_faults(views: Sequence[ViewSource]) -> Iterator[Fault]:

@@ -68,11 +68,11 @@ def load_weights(codec: Autoencoder, path: str | Path) -> None:
 def _load(path: Path) -> Any:
     if path.suffix != ".safetensors":
         return load_plain(path)
+    if not path.is_file():  # nor a pipe, which would be waited for without end
+        raise FileNotFoundError(f"autoencoder {path}: file must exist, got none")
     try:
         return load_file(path)
     except (SafetensorError, OSError) as error:
-        if not path.is_file():
-            raise FileNotFoundError(f"autoencoder {path}: file must exist, got none") from None
         raise ValueError(f"autoencoder {path}: must be safetensors, got {error}") from None
 
 

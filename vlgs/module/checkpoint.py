@@ -112,6 +112,8 @@ def _read(path: Path) -> Checkpoint:
     """Raises ValueError, with what follows the file's name in a sentence."""
     from safetensors import SafetensorError, safe_open
 
+    if not path.is_file():
+        raise ValueError("is no file")
     try:
         with safe_open(path, framework="pt") as file:
             outer = file.metadata() or {}

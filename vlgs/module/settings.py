@@ -8,6 +8,9 @@ from vlgs.values import require_range
 MOST_ITERATIONS = 10**9
 """Upper limit of `iterations`, far above any useful value."""
 
+SMALLEST_RATE = 1e-30
+"""Above 0; the decay from one rate to another would leave the range of floats beyond it."""
+
 
 @dataclass(frozen=True)
 class LearningRates:
@@ -33,6 +36,11 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         require_range("learning_rates", 0, 1, **asdict(self))
+        for name, rate in asdict(self).items():
+            if 0 < rate < SMALLEST_RATE:
+                raise ValueError(
+                    f"learning_rates: {name} must be 0 or {SMALLEST_RATE:g} to 1, got {rate}"
+                )
 
     def of(self, parameter: str) -> float:
         """Rate of a parameter of the Gaussians; language's own shape is learned like colour's."""

@@ -89,7 +89,8 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "failure": ("", "why nothing could be scored although it was asked for; null for a good run"),
     "reasons": (
         "",
-        "metric that is null -> why; under `words` what the pictures ask of a scene without labels",
+        "metric that is null -> why; under `words` what the pictures ask of a scene without labels, under `pictures` of which "
+        "model they are where each mask level has one",
     ),
 }
 """Entry of metrics.json -> (unit or range, meaning). An entry that could not be computed is null."""

@@ -159,6 +159,23 @@ class Composer:
             raise UnknownOptionError(known["refused"])
         return Identity(**known, seed=seed)
 
+    def require_sound(self, source: Path) -> None:
+        """Do nothing if the configuration has the options of the benchmark itself.
+
+        Args:
+            source: File that it was read from.
+
+        Raises:
+            ValueError: If it has not: then no row can be run, and it is not the rows' fault.
+        """
+        try:
+            self.identity((), self.benchmark.seeds[0])
+        except UnknownOptionError as error:
+            raise ValueError(
+                f"{source}: overrides must be options of the configuration, got {error}; take the file from version control, or "
+                "delete it, and python -m vlgs.ablate writes it again"
+            ) from error
+
     def takes_scenes(self) -> bool:
         """Whether a run is told its scene (`data.scene`), or `data.root` is the scene."""
         data = _compose(list(self.benchmark.overrides)).data

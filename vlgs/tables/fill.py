@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from vlgs.config import split_override
-from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.frame import Line, Lines
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE, Table
@@ -85,7 +85,7 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, lines: Lines) -
         lines: Of all runs.
 
     Raises:
-        ValueError: If a row names an option that does not exist.
+        UnknownOptionError: If a row names an option that does not exist; the file and the row are named.
     """
     entries = {QUANTITIES[name].entry for name in table.metrics}
     entries = {"per_category"} if table.by_category else entries
@@ -96,7 +96,13 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, lines: Lines) -
     for index, row in enumerate(table.rows):
         if row.overrides is None:
             continue
-        wanted = composer.identity(row.overrides, benchmark.seeds[0])
+        try:
+            wanted = composer.identity(row.overrides, benchmark.seeds[0])
+        except UnknownOptionError as error:
+            where = f"{table.source}: rows[{index}].set"
+            raise UnknownOptionError(
+                f"{where} must be options of the configuration, got {error}"
+            ) from error
         recipes[index] = wanted.recipe
         found = [
             line

@@ -45,6 +45,8 @@ RUN_COLUMNS = Line._fields[: Line._fields.index("cpu")]
 
 DETAILS = {"per_category", "category_kinds", "indicator", "per_view", "reasons", "machine", "skips"}
 """Entries of metrics.json that are not one value."""
+MOST_PLACES = 6
+"""Runs that an error lists."""
 
 
 def read_metrics(results: Path) -> list[dict[str, Any]]:
@@ -194,11 +196,16 @@ def write_frame(frame: pd.DataFrame, results: Path) -> None:
     write_atomically(results / "runs.parquet", parquet)
 
 
-def require_one_meaning(frame: pd.DataFrame) -> None:
+def require_one_meaning(frame: pd.DataFrame, results: Path) -> None:
     """Refuse what must not stand in one table.
 
+    Args:
+        frame: As from `tidy`.
+        results: Folder that the runs were read from.
+
     Raises:
-        ValueError: If two runs claim one recipe, data, scene and seed, or runs of one data set differ in protocol.
+        ValueError: If two runs claim one recipe, data, scene and seed, or runs of one data set differ in protocol; it says where
+            the runs stand.
     """
     runs = frame.drop_duplicates("config_hash")
     same = runs[runs.duplicated(["recipe", "data_recipe", "scene", "seed"], keep=False)]
@@ -211,12 +218,24 @@ def require_one_meaning(frame: pd.DataFrame) -> None:
             ).all(axis=1)
         ]
         raise ValueError(
-            f"results: runs of one row, scene {first['scene']} and seed {first['seed']} must be one, got "
-            f"{', '.join(twins['config_hash'])}, whose data differ; remove all but one of the folders"
+            f"{results}: runs of one row, scene {first['scene']} and seed {first['seed']} must be one, got "
+            f"{_places(twins['config_hash'], results)}, whose data differ; remove all but one"
         )
     for (recipe, data), group in runs.groupby(["recipe", "data_recipe"]):
         protocols = sorted(set(group["protocol"].dropna()))
         if len(protocols) > 1:
             raise ValueError(
-                f"results: runs of recipe {recipe} on data {data} must share a protocol, got {', '.join(protocols)}"
+                f"{results}: runs of recipe {recipe} on data {data} must share a protocol, got {', '.join(protocols)} in "
+                f"{_places(group['config_hash'], results)}; remove those of all but one"
             )
+
+
+def _places(runs: Iterable[str], results: Path) -> str:
+    """Where each run stands, a few of them."""
+    names, folders = list(runs), {path.parent for path in (results / "runs").glob("*/metrics.json")}
+    found = []
+    for name in names[:MOST_PLACES]:
+        folder = results / "runs" / name
+        found.append(str(folder) if folder in folders else f"{name:.80} of {results / 'runs.csv'}")
+    more = [f"{len(names) - MOST_PLACES} more"] if len(names) > MOST_PLACES else []
+    return ", ".join(found + more)

@@ -87,6 +87,8 @@ class Table:
     """Number of the table in the paper's PDF, by which comments cite it; None for a table of our own."""
     kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
     """Category -> ``translucent_reflective`` or ``other``."""
+    source: str = "sweeps"
+    """File that it was read from, for errors."""
 
     @property
     def runnable(self) -> tuple[Row, ...]:
@@ -173,6 +175,7 @@ def load_table(path: Path) -> Table:
         rows=rows,
         by_category=by_category,
         kinds=kinds,
+        source=where,
     )
 
 
@@ -213,6 +216,8 @@ def read_yaml(path: Path) -> Any:
     Raises:
         ValueError: If it is none; the file is named.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        raise ValueError(f"{path}: must be a file, got a folder or a device")
     content = path.read_bytes()
     try:
         if sum(map(content.count, (b"[", b"{", b"- -", b"? ?"))) > DEEPEST:

@@ -57,7 +57,7 @@ def write_all(
             f"tables: {results} must hold finished runs (runs/*/metrics.json) or runs.csv, got neither"
         )
     frame = tidy(lines)
-    require_one_meaning(frame)
+    require_one_meaning(frame, results)
     write_frame(frame, results)
     current = [line for line in lines if line.results_version == RESULTS_VERSION]
     if len(current) < len(lines):
@@ -76,6 +76,7 @@ def write_all(
                 filled.append(fill(table, benchmark, composer, rows))
                 fitting.add(table.label)
             except UnknownOptionError as error:
+                composer.require_sound(file)
                 refused[table.label] = error
         composer.save()
         filled = [table for table in filled if table.runs]

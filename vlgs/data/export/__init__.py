@@ -8,7 +8,6 @@
 """
 
 import json
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -20,6 +19,7 @@ from PIL import Image
 from vlgs.data.export.outline import outlines
 from vlgs.data.export.sparse import write_sparse
 from vlgs.data.language import write_mask_files
+from vlgs.files import new_folder
 from vlgs.types import Scene, View, Vocabulary
 
 
@@ -62,10 +62,8 @@ def write_scene(
         raise ValueError(f"write_scene: language must name views of the scene, got {unknown[0]}")
     if short := [name for name, levels in language.items() if len(levels) != 4]:
         raise ValueError(f"write_scene: language must have 4 levels, got {len(language[short[0]])}")
-    root.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=root.parent, prefix=f".{root.name}-") as scratch:
-        folder = Path(scratch) / "scene"
-        (folder / "images").mkdir(parents=True)
+    with new_folder(root) as folder:
+        (folder / "images").mkdir()
         for view in views:
             Image.fromarray(view.read_image().numpy()).save(folder / "images" / f"{view.name}.png")
         write_sparse(folder / "sparse" / "0", scene, views)
@@ -73,7 +71,6 @@ def write_scene(
         _write_objects(folder / "label", views)
         if language:
             _write_language(folder / "language_features", language, scene.vocabulary)
-        folder.replace(root)
 
 
 def _name(view: View) -> str:

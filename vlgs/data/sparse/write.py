@@ -1,6 +1,5 @@
 """A `SparseModel` as COLMAP's files, through COLMAP's own writer."""
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from vlgs.data.lens import import_pycolmap
 from vlgs.data.sparse.model import SparseModel
+from vlgs.files import new_folder
 
 
 def write_colmap(folder: Path, model: SparseModel, text: bool = False) -> None:
@@ -28,12 +28,8 @@ def write_colmap(folder: Path, model: SparseModel, text: bool = False) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"colmap: OUT must be a new or empty folder, got {folder}")
     whole = _reread(model) if model.suffix in (".bin", ".txt") else _rebuild(model)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
-        out = Path(scratch) / "model"
-        out.mkdir()
+    with new_folder(folder) as out:
         whole.write_text(str(out)) if text else whole.write(str(out))
-        out.replace(folder)
 
 
 def _reread(model: SparseModel) -> Any:
