@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vlgs.render import cpu
+from vlgs.ops.project import project
 from vlgs.types import Camera, Gaussians, RasterConfig, Shape
 
 SLACK = 1.0
@@ -28,7 +28,7 @@ def may_see(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> Bool[
 def _reaches(
     means: Float[Tensor, "n 3"], shape: Shape, camera: Camera, config: RasterConfig
 ) -> Bool[Tensor, " n"]:
-    splats = cpu.project(means, shape.quats, shape.scales, camera, config)
+    splats = project(means, shape.quats, shape.scales, camera, config)
     reach = math.sqrt(2 * math.log(1 / config.alpha_min)) * (1 + 1e-5)
     inv_x, slope, inv_y = splats.ellipse.unbind(1)
     half_y = reach / inv_y
