@@ -1,4 +1,4 @@
-// What Python sees. Shapes that belong together are checked where the tensors come from (vlgs/render); here
+// What Python sees. Shapes that belong together are checked where the tensors come from (vlgs/ops); here
 // arrays become pointers, the interpreter lock is released, and nothing is computed.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>

@@ -5,24 +5,17 @@ may even be NaN.
 """
 
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Literal, cast
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import l1_loss
 
-from vlgs import _csrc
+from vlgs.ops import l1_dssim as ops_l1_dssim
+from vlgs.ops import ssim as ops_ssim
+from vlgs.ops.squared_error import Pixels, squared_error
 
-Pixels = Literal["valid", "all"]
-"""Whose number an average is divided by: pixels that have a target, or all of them (as LangSplat does)."""
-
-SSIM_WINDOW = 11
-SSIM_SIGMA = 1.5
-SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2
 L1_SHARE = 0.8
 RENDER_FLOOR = 1e-2
 """Shorter renders are treated as this long in `masked_cosine`: codes start at zero, where a cosine has no slope."""
@@ -46,7 +39,7 @@ def masked_mse(
         (tensor(4.), tensor(2.))
     """
     _require_shapes("masked_mse", render, target, valid)
-    return cast(Tensor, _SquaredError.apply(render, target, valid, pixels))
+    return squared_error(render, target, valid, pixels)
 
 
 def masked_l1(
@@ -111,7 +104,7 @@ def ssim_map(a: Float[Tensor, "h w c"], b: Float[Tensor, "h w c"]) -> Float[Tens
     """
     _require_shapes("ssim", a, b)
     _require_pixels("ssim", a)
-    return cast(Tensor, _Ssim.apply(a, b))
+    return ops_ssim.ssim_map(a, b)
 
 
 def l1_dssim(
@@ -128,7 +121,7 @@ def l1_dssim(
     """
     _require_shapes("l1_dssim", render, image, valid)
     _require_pixels("l1_dssim", render)
-    return cast(Tensor, _L1Dssim.apply(render, image, valid))
+    return ops_l1_dssim.l1_dssim(render, image, valid, L1_SHARE)
 
 
 @torch.no_grad()
@@ -206,90 +199,6 @@ class Losses:
 
 
 _LANGUAGE = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
-
-
-class _SquaredError(torch.autograd.Function):
-    """`masked_mse`; csrc/squared_error.cpp."""
-
-    @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, valid: Tensor | None, pixels: Pixels):
-        render, target = render.contiguous(), target.contiguous()
-        valid = None if valid is None else valid.contiguous()
-        total, count = _csrc.squared_error(render, target, valid, torch.get_num_threads())
-        ctx.save_for_backward(render, target, valid)
-        ctx.numbers = max(render.numel() if pixels == "all" else count * render.shape[-1], 1)
-        return render.new_tensor(total / ctx.numbers)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, d_loss: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        render, target, valid = ctx.saved_tensors
-        d_render = torch.empty_like(render)
-        scale = 2 * d_loss.item() / ctx.numbers
-        threads = torch.get_num_threads()
-        _csrc.squared_error_backward(render, target, valid, scale, d_render, threads)
-        return d_render, -d_render if ctx.needs_input_grad[1] else None, None, None
-
-
-class _Ssim(torch.autograd.Function):
-    """`ssim_map`; csrc/ssim.cpp."""
-
-    @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor):
-        a, b = a.contiguous(), b.contiguous()
-        ctx.save_for_backward(a, b)
-        out = a.new_empty(a.shape[2], *a.shape[:2])
-        _csrc.ssim_map(a, b, _taps(a.dtype), _FLOORS, out, torch.get_num_threads())
-        return out.permute(1, 2, 0)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, d_out: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        a, b = ctx.saved_tensors
-        d_out, taps, threads = d_out.contiguous(), _taps(a.dtype), torch.get_num_threads()
-        d_a, d_b = torch.empty_like(a), torch.empty_like(b) if ctx.needs_input_grad[1] else None
-        _csrc.ssim_map_backward(a, b, taps, _FLOORS, d_out, d_a, d_b, threads)
-        return d_a, d_b
-
-
-class _L1Dssim(torch.autograd.Function):
-    """`l1_dssim`; csrc/ssim.cpp."""
-
-    @staticmethod
-    def forward(ctx: Any, render: Tensor, image: Tensor, valid: Tensor | None):
-        render, image = render.contiguous(), image.contiguous()
-        valid = None if valid is None else valid.contiguous()
-        ctx.save_for_backward(render, image, valid)
-        distance, dissimilarity, count = _csrc.ssim_sums(
-            render, image, valid, _taps(render.dtype), _FLOORS, torch.get_num_threads()
-        )
-        ctx.numbers = max(count * render.shape[-1], 1)
-        total = L1_SHARE * distance + (1 - L1_SHARE) * dissimilarity
-        return render.new_tensor(total / ctx.numbers)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, d_loss: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        render, image, valid = ctx.saved_tensors
-        d_render = torch.empty_like(render)
-        d_image = torch.empty_like(image) if ctx.needs_input_grad[1] else None
-        scale = d_loss.item() / ctx.numbers
-        _csrc.ssim_sums_backward(
-            render, image, valid, _taps(render.dtype), _FLOORS,
-            L1_SHARE * scale, (1 - L1_SHARE) * scale, d_render, d_image, torch.get_num_threads(),
-        )  # fmt: skip
-        return d_render, d_image, None
-
-
-_FLOORS = (2 * SSIM_C1, 2 * SSIM_C2)
-"""Of luminance and structure, for twice the moments (`ssim_map`)."""
-
-
-@cache
-def _taps(dtype: torch.dtype) -> Float[Tensor, " taps"]:
-    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    return (weights / weights.sum()).to(dtype)
 
 
 def _filled(target: Tensor, valid: Tensor, render: Tensor) -> Tensor:

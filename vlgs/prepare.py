@@ -48,7 +48,7 @@ def prepare(config: DictConfig) -> Prepared:
     import torch
 
     from vlgs.interchange import file_digest
-    from vlgs.render.rasterize import check_config as check_constants
+    from vlgs.ops.rasterize import check_config as check_constants
 
     torch.set_num_threads(config.threads)
     check_constants(_make_parts(config).raster)

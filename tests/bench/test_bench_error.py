@@ -22,7 +22,8 @@ from vlgs.bench.scenes import (
 from vlgs.bench.sheet import read_sheet
 from vlgs.bench.switches import check_switch, raster_switches
 from vlgs.bench.workload import Workload, make_workload
-from vlgs.render import cpu
+from vlgs.ops.blend import count_work
+from vlgs.ops.project import project
 from vlgs.types import RasterConfig
 
 
@@ -130,10 +131,10 @@ def test_skipped_blocks_are_those_of_the_masks():
     boxes = switches._count(w, replace(off, tile_test=False))
     assert boxes.entries > entries
     # More chains than one pass over the tiles carries.
-    splats = cpu.project(w.means, w.quats, w.scales, w.camera, off)
+    splats = project(w.means, w.quats, w.scales, w.camera, off)
     groups = [replace(w.groups[0], weight=w.groups[0].weight.clone()) for _ in range(5)]
-    n = cpu.count_work(splats, groups[:1], w.camera, off).entries
-    assert cpu.count_work(splats, groups, w.camera, off) == (n, 5 * 16 * n)
+    n = count_work(splats, groups[:1], w.camera, off).entries
+    assert count_work(splats, groups, w.camera, off) == (n, 5 * 16 * n)
     with pytest.raises(ValueError, match="stop must be after where work is counted, got before"):
         switches._count(w, replace(off, stop="before"))
 

@@ -18,7 +18,7 @@ from vlgs.bench.workload import make_workload
 from vlgs.blend import blend_camera
 from vlgs.blend.ratio import FixedBlend
 from vlgs.module.state import capture
-from vlgs.render.frozen import FrozenView
+from vlgs.ops.frozen import FrozenView
 from vlgs.skips import SKIPS
 from vlgs.types import Camera
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from vlgs import _csrc
-from vlgs.fusion.attention import CrossAttention, SelfAttention, Token
+from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.mlp import MLP
+from vlgs.ops.attention import Token
 
 READINGS = [(4, 1), (1, 4), (2, 3)]
 """(width, heads): the default, the other reading of Eq. 5, and a mix of both."""

@@ -31,7 +31,7 @@ DANGEROUS = (
         "vlgs.run.os.system",
     ),
     *("vlgs.fusion.none.__builtins__.eval", "vlgs.fusion.attention.torch.load", "vlgs.run.main"),
-    *("vlgs.fusion.attention._csrc.rasterize", "vlgs.sfm.worker.main", "vlgs.files.os.remove"),
+    *("vlgs.ops.rasterize._csrc.rasterize", "vlgs.sfm.worker.main", "vlgs.files.os.remove"),
     *("hydra.utils.get_method", "hydra.utils.instantiate", "hydra._internal.utils._locate"),
     *("numpy.load", "numpy.ctypeslib.load_library", "pickle.loads", "yaml.unsafe_load"),
     *("evil_lab.strike", "evil_lab", ".evil_lab.strike", "evil_lab..strike", "evil lab.strike"),

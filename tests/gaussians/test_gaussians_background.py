@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vlgs.gaussians import GaussiansConfig, initialise
 from vlgs.gaussians.background import background, with_background
-from vlgs.geometry import pose_matrix, scene_extent
+from vlgs.geometry import camera_center, pose_matrix, scene_extent
 from vlgs.types import Camera, Scene, View
 
 WIDTH, HEIGHT = 64, 48
@@ -77,11 +77,13 @@ def test_what_lies_behind_the_points_has_the_colour_that_views_see_there():
     assert (cloud.colors - torch.tensor(BELOW) / 255).norm(dim=1).min() > 0.1
 
 
-def test_no_background_is_nearer_than_the_cameras_stand_apart():
-    toy = scene(shell(-5.0) / 40)  # a thing in the middle of a ring of cameras, 2 units from it
-    extent = scene_extent(torch.stack([v.camera.viewmat for v in toy.train]))
-    distance = background(toy, 500).points.norm(dim=1)
-    assert distance.min() >= 0.999 * extent
+def test_no_background_stands_near_a_camera():
+    toy = scene(shell(-5.0) / 3)  # behind these points, 2 units from the middle, stand the cameras
+    viewmats = torch.stack([v.camera.viewmat for v in toy.train])
+    points = background(toy, 500).points
+    assert torch.cdist(points, camera_center(viewmats)).min() >= scene_extent(viewmats)
+    beside = points[(points[:, 2] / points.norm(dim=1)).abs() < 0.3].norm(dim=1)
+    assert beside.min() > 9 * scene_extent(viewmats)  # far instead
 
 
 def test_the_first_gaussians_stay_and_the_background_comes_after_them():

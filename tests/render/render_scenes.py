@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vlgs.render import rasterize, reference
+from vlgs.ops import rasterize_reference as reference
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
 
 WIDTH, HEIGHT = 37, 29  # odd, unequal, and neither a multiple of a block nor of a tile

@@ -26,7 +26,7 @@ from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
 from vlgs.fusion.mlp import MLP
 from vlgs.gaussians.parameters import activate
-from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color
+from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.indicator import ColourOpacity, Learned, PerLevel
 from vlgs.losses import (
@@ -38,14 +38,19 @@ from vlgs.losses import (
     ssim,
     ssim_map,
 )
+from vlgs.ops import l1_dssim as ops_l1_dssim
+from vlgs.ops import ssim as ops_ssim
+from vlgs.ops.attention import Token, attend
+from vlgs.ops.frozen import FrozenView
+from vlgs.ops.squared_error import squared_error
+from vlgs.ops.view_color import view_color
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.query.similarity import cosines, decoded_cosines
 from vlgs.render import rasterize
-from vlgs.render.frozen import FrozenView
 from vlgs.render.model import SplatModel
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
-AREAS = ("render", "losses", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+AREAS = ("ops", "render", "losses", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up."""
 
 NO_GRADIENT = {
@@ -75,7 +80,8 @@ NO_GRADIENT = {
     "vlgs.render.level.LevelModel.fuse": "for questions: a level of what SplatModel.fuse gives",
     "vlgs.render.level.LevelModel.render": "SplatModel.render",
     "vlgs.render.level.LevelModel.render_values": "SplatModel.render_values",
-    "vlgs.render.cpu.freeze": "the constants of a FrozenView",
+    "vlgs.ops.blend.weights_alone": "the constants of a FrozenView",
+    "vlgs.ops.frozen.Weights.render": "protocol",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
 }
@@ -90,6 +96,8 @@ def draw(*shape: int, seed: int = 0, low: float = -1.0, high: float = 1.0) -> Te
 
 VALID = torch.tensor([[True, False, True, True]] * 3)
 SIZE = (3, 4, 2)
+LAYERS = ((6, 3), (6,), (12, 3), (12,), (3, 6), (3,))
+"""Weights and biases of self-attention over three channels: queries, keys and values, output."""
 LAYER = torch.nn.Linear(2, 3).double().requires_grad_(False)
 
 
@@ -213,14 +221,13 @@ def both(loss: Callable[..., Tensor], *rest: object) -> Check:
 
 rotation = quat_to_rotmat(draw(4, 4, seed=4))
 CHECKS: dict[str, Callable[[], Check]] = {
-    "vlgs.render.rasterize.rasterize": lambda: rasterizing("cpu", False),
-    "vlgs.render.rasterize.rasterize outside the clamp": lambda: rasterizing("cpu", True),
-    "vlgs.render.rasterize.rasterize shape_grad off": shape_alone,
-    "vlgs.render.cpu.rasterize": lambda: rasterizing("cpu", False),
-    "vlgs.render.cpu.blend": lambda: rasterizing("cpu", False),
-    "vlgs.render.cpu.project": lambda: rasterizing("cpu", True),
-    "vlgs.render.reference.rasterize": lambda: rasterizing("reference", False),
-    "vlgs.render.frozen.FrozenView.render": frozen,
+    "vlgs.ops.rasterize.rasterize": lambda: rasterizing("cpu", False),
+    "vlgs.ops.rasterize.rasterize outside the clamp": lambda: rasterizing("cpu", True),
+    "vlgs.ops.rasterize.rasterize shape_grad off": shape_alone,
+    "vlgs.ops.blend.blend": lambda: rasterizing("cpu", False),
+    "vlgs.ops.project.project": lambda: rasterizing("cpu", True),
+    "vlgs.ops.rasterize_reference.rasterize": lambda: rasterizing("reference", False),
+    "vlgs.ops.frozen.FrozenView.render": frozen,
     "vlgs.render.model.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
     "vlgs.render.model.SplatModel.gaussians": lambda: model(
         lambda m: tensors(m.gaussians())
@@ -232,6 +239,13 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.render.model.SplatModel.render_values": lambda: model(
         lambda m: m.render_values(view(), m.splats["features"], m.gaussians().indicators)
     ),
+    "vlgs.ops.attention.attend": lambda: (
+        lambda color, feature, *layers: attend(color, feature, Token(1, 2), layers, True),
+        [draw(3, 2), draw(3, 1, seed=1), *(draw(*s, seed=i) for i, s in enumerate(LAYERS))],
+    ),
+    "vlgs.ops.squared_error.squared_error": lambda: both(squared_error, VALID, "all"),
+    "vlgs.ops.ssim.ssim_map": lambda: (ops_ssim.ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),
+    "vlgs.ops.l1_dssim.l1_dssim": lambda: both(ops_l1_dssim.l1_dssim, VALID, 0.3),
     "vlgs.losses.masked_mse": lambda: both(masked_mse, VALID),
     "vlgs.losses.masked_l1": lambda: both(masked_l1, VALID),
     "vlgs.losses.masked_cosine": lambda: both(masked_cosine, VALID),
@@ -275,7 +289,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     ),
     "vlgs.gaussians.sh.sh_to_rgb": lambda: (sh_to_rgb, [draw(4, 3)]),
     "vlgs.gaussians.sh.rgb_to_sh": lambda: (rgb_to_sh, [draw(4, 3)]),
-    **{f"vlgs.gaussians.sh.view_color of degree {degree}": partial(coloring, degree) for degree in range(4)},
+    **{f"vlgs.ops.view_color.view_color of degree {degree}": partial(coloring, degree) for degree in range(4)},
     "vlgs.codec.autoencoder.Autoencoder.encode": lambda: (codec().encode, [draw(3, 5)]),
     "vlgs.codec.autoencoder.Autoencoder.decode": lambda: (codec().decode, [draw(3, 3)]),
     "vlgs.codec.identity.Identity.encode": lambda: (Identity(3).encode, [draw(4, 3)]),

@@ -254,16 +254,16 @@ def fuzz(parser: ArgumentParser) -> Runner:
     parser.add_argument("--first", type=int, help="first seed; default: 0, and record")
 
     def run(args: Namespace) -> int:
-        from vlgs import _csrc
         from vlgs.bench.fuzz import fuzz as run_seeds
         from vlgs.bench.fuzz_sheet import CLEAN, run_fuzz
+        from vlgs.ops.machine import instruction_set
 
         count = 20 if args.quick else args.scenes
         if args.first is not None:
             report = run_seeds(range(args.first, args.first + count))
             print(report)
             return int(bool(report.failures))
-        row = run_fuzz(_csrc.isa(), "none", count, run_seeds, args.out / "fuzz.csv")
+        row = run_fuzz(instruction_set(), "none", count, run_seeds, args.out / "fuzz.csv")
         return int(row.outcome != CLEAN)
 
     return run

@@ -46,9 +46,9 @@ class Child:
 
 def current_isa() -> str:
     """The instruction set of the process that this runs in."""
-    from vlgs import _csrc
+    from vlgs.ops.machine import instruction_set
 
-    return _csrc.isa()
+    return instruction_set()
 
 
 def free_memory() -> int:

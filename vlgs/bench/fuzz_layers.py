@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vlgs import _csrc
 from vlgs.fusion.attention import CrossAttention, SelfAttention
-from vlgs.gaussians.sh import view_color
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
-from vlgs.render.frozen import FrozenView
+from vlgs.ops.frozen import FrozenView
+from vlgs.ops.machine import multiply_adds
+from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, RasterConfig
 
 ROWS = (0, 1, 2, 15, 16, 17, 40)
@@ -44,7 +44,7 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
     _squared_error(rng, poison)
     packs = int(rng.integers(0, 1000))
-    _require(_csrc.multiply_adds(packs) >= packs, "the yardstick did less than it was asked for")
+    _require(multiply_adds(packs) >= packs, "the yardstick did less than it was asked for")
 
 
 def run_frozen(

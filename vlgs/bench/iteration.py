@@ -14,11 +14,9 @@ from hydra import compose, initialize_config_dir
 from rich.table import Table
 
 from vlgs.config import CONF, instantiate
-from vlgs.fusion import attention
-from vlgs.gaussians import sh
 from vlgs.module.build import Parts, build_module
 from vlgs.module.lightning import VLGSModule
-from vlgs.render import cpu
+from vlgs.ops import attention, blend, project, view_color
 
 KERNELS = ("project", "blend", "fusion", "Adam")
 """Parts that are not overhead: everything else is called the rest."""
@@ -105,10 +103,10 @@ def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
 def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
     """What is timed, and as which part."""
     functions = {
-        "project": cpu._Project,
-        "blend": cpu._Blend,
+        "project": project._Project,
+        "blend": blend._Blend,
         "fusion": attention._Attention,
-        "spherical harmonics": sh._ViewColor,
+        "spherical harmonics": view_color._ViewColor,
     }
     for part, function in functions.items():
         yield function, "forward", part

@@ -11,12 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from vlgs import _csrc
 from vlgs.bench.child import Child, free_memory
 from vlgs.bench.clock import Pass, Spread, spreads, take_turns, time_pass
 from vlgs.bench.sheet import provenance, say, show, write_sheet
 from vlgs.bench.workload import Workload, make_workload
-from vlgs.render import cpu, rasterize
+from vlgs.ops.blend import blend
+from vlgs.ops.machine import instruction_sets, multiply_adds
+from vlgs.ops.project import Splats, project
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import RasterConfig
 
 ISAS = ("v4", "v3", "base")
@@ -153,10 +155,10 @@ def _children(isas: Sequence[str], stack: ExitStack) -> dict[str, Child]:
     """A process for every instruction set that this CPU and this build have."""
     children: dict[str, Child] = {}
     for isa in isas:
-        if isa in _csrc.isas().split():
+        if isa in instruction_sets():
             children[isa] = stack.enter_context(Child(isa))
         else:
-            say(f"{isa}: this CPU and this build have {_csrc.isas()}; left out")
+            say(f"{isa}: this CPU and this build have {' '.join(instruction_sets())}; left out")
     return children
 
 
@@ -225,7 +227,7 @@ def multiply_add_rate() -> float:
     rates: list[float] = []
     for _ in range(15):
         start = thread_time()
-        done = _csrc.multiply_adds(20_000_000)
+        done = multiply_adds(20_000_000)
         rates.append(done / (thread_time() - start) / 1e9)
     return max(rates)
 
@@ -260,14 +262,12 @@ def _call(w: Workload, backend: str) -> Sequence[Tensor]:
     ).images  # fmt: skip
 
 
-def _blend(w: Workload) -> tuple[cpu.Splats, Callable[[], Sequence[Tensor]]]:
+def _blend(w: Workload) -> tuple[Splats, Callable[[], Sequence[Tensor]]]:
     config = RasterConfig()
     with torch.no_grad():
-        splats = cpu.project(w.means, w.quats, w.scales, w.camera, config)
-    leaves = cpu.Splats(
-        splats.mean2d.requires_grad_(), splats.ellipse.requires_grad_(), splats.depth
-    )
-    return leaves, lambda: cpu.blend(leaves, w.groups, w.camera, config).images
+        splats = project(w.means, w.quats, w.scales, w.camera, config)
+    leaves = Splats(splats.mean2d.requires_grad_(), splats.ellipse.requires_grad_(), splats.depth)
+    return leaves, lambda: blend(leaves, w.groups, w.camera, config).images
 
 
 def _bytes(size: Size, channels: int, dense: bool) -> int:

@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from vlgs import _csrc
 from vlgs.files import write_atomically
+from vlgs.ops.machine import instruction_set
 from vlgs.report.provenance import commit, machine
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def provenance(seed: int | None, **notes: object) -> dict[str, object]:
     return {
         "command": " ".join(["python -m vlgs.bench", *sys.argv[1:]]),
         **machine(),
-        "isa": _csrc.isa(),
+        "isa": instruction_set(),
         "load": f"{load} (one-minute average when it began)",
         "commit": commit(),
         "seed": seed,

@@ -7,7 +7,8 @@ import torch
 from vlgs.bench.checks import Check, check_bound, check_exact
 from vlgs.bench.outcome import compare, largest_value, outcome
 from vlgs.bench.workload import Workload
-from vlgs.render import cpu
+from vlgs.ops.blend import Work, count_work
+from vlgs.ops.project import project
 from vlgs.skips import SKIPS, Skip
 from vlgs.types import RasterConfig
 
@@ -58,10 +59,10 @@ def skipped_share(w: Workload, switch: RasterSwitch) -> float:
     return 1 - done / whole if whole else 0.0
 
 
-def _count(w: Workload, config: RasterConfig) -> cpu.Work:
+def _count(w: Workload, config: RasterConfig) -> Work:
     with torch.no_grad():
-        splats = cpu.project(w.means, w.quats, w.scales, w.camera, config)
-    return cpu.count_work(splats, w.groups, w.camera, config)
+        splats = project(w.means, w.quats, w.scales, w.camera, config)
+    return count_work(splats, w.groups, w.camera, config)
 
 
 def check_switch(scene: str, w: Workload, switch: RasterSwitch) -> list[Check]:

@@ -1,26 +1,18 @@
-"""Fusion by attention over the channels of one Gaussian; csrc/attention.cpp computes it, both ways."""
+"""Fusion by attention over the channels of one Gaussian; `vlgs.ops.attention` computes it, both ways."""
 
-from typing import Any, Literal, NamedTuple, cast
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
-from vlgs import _csrc
 from vlgs.fusion import require_channels
+from vlgs.ops.attention import Token, attend
 
 MAX_CHANNELS = 64
 """A Gaussian costs ``channels^2 * heads * width`` operations, and the layers hold as many weights."""
 
 Init = Literal["zero", "xavier"]
-
-
-class Token(NamedTuple):
-    """What every channel becomes."""
-
-    heads: int
-    width: int
 
 
 class SelfAttention(nn.Module):
@@ -128,39 +120,8 @@ def _attend(
     if len(color) != len(feature):
         raise ValueError(f"{who}: feature must have {len(color)} rows, got {len(feature)}")
     mixes_color = who == "SelfAttention"
-    fused = cast(tuple[Tensor, ...], _Attention.apply(token, mixes_color, color, feature, *layers))
+    fused = attend(color, feature, token, layers, mixes_color)
     return (fused[0], fused[1]) if mixes_color else (color, fused[0])
-
-
-class _Attention(torch.autograd.Function):
-    """(fused colour, fused language), or the second alone in cross-attention."""
-
-    @staticmethod
-    def forward(ctx: Any, token: Token, mixes_color: bool, *tensors: Tensor):
-        tensors = tuple(t.contiguous() for t in tensors)
-        color, feature, *layers = tensors
-        out_color = torch.empty_like(color) if mixes_color else None
-        out_feature = torch.empty_like(feature)
-        threads = torch.get_num_threads()
-        _csrc.attention(
-            color, feature, layers, token.heads, token.width, mixes_color, out_color, out_feature, threads,
-        )  # fmt: skip
-        ctx.save_for_backward(*tensors)
-        ctx.token, ctx.mixes_color = token, mixes_color
-        return (out_feature,) if out_color is None else (out_color, out_feature)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        color, feature, *layers = ctx.saved_tensors
-        d_color, d_feature, *d_layers = (torch.empty_like(t) for t in ctx.saved_tensors)
-        *d_out_color, d_out_feature = (d.contiguous() for d in grad_outputs)
-        _csrc.attention_backward(
-            color, feature, layers, ctx.token.heads, ctx.token.width, ctx.mixes_color,
-            d_out_color[0] if d_out_color else None,
-            d_out_feature, d_color, d_feature, d_layers, torch.get_num_threads(),
-        )  # fmt: skip
-        return (None, None, d_color, d_feature, *d_layers)
 
 
 def _require_sizes(who: str, color_dim: int, feature_dim: int, width: int, heads: int) -> None:

@@ -5,8 +5,9 @@ from vlgs.gaussians.densify import DensifyReport, DensifyState, densify, reset_o
 from vlgs.gaussians.init import initialise
 from vlgs.gaussians.parameters import LANGUAGE_SHAPE, PARAMETERS, activate
 from vlgs.gaussians.ply import read_ply, write_ply
-from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb, view_color
+from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.gaussians.sharing import Sharing
+from vlgs.ops.view_color import view_color
 
 __all__ = [
     "LANGUAGE_SHAPE",

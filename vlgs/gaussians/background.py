@@ -49,7 +49,7 @@ def with_background(
     sphere = background(scene, config.background)
     if len(sphere.points) == 0:
         return parameters
-    middle, _ = _middle(scene)
+    middle = _cameras(scene)[0].mean(dim=0)
     # The distance of neighbours on a sphere of this many directions.
     scales = (sphere.points - middle).norm(dim=1) * math.sqrt(4 * math.pi / config.background)
     behind = parameters_of(sphere, scales, config, parameters["features"].shape[1])
@@ -68,7 +68,8 @@ def background(scene: Scene, count: int) -> Cloud:
     points = points[:: -(-len(points) // MAX_POINTS) or 1]
     if count == 0 or len(points) == 0:
         return Cloud(points[:0], points[:0])
-    middle, extent = _middle(scene)
+    centers, extent = _cameras(scene)
+    middle = centers.mean(dim=0)
     within = (points - middle).norm(dim=1).quantile(0.95).item()
     far = max(CAMERA_SHARE * extent, POINT_SHARE * within)
     directions = _directions(count)
@@ -86,7 +87,10 @@ def background(scene: Scene, count: int) -> Cloud:
     if not seen.any():  # cameras that see nothing of the sphere: of a huge focal length, or a principal point far out
         return Cloud(points[:0], points[:0])
     known = 2 * past > seen
-    reach = _reach(points - middle, directions).clamp(extent, far).masked_fill(known, far)
+    reach = _reach(points - middle, directions).clamp_max(far).masked_fill(known, far)
+    # Near a camera it would stand before the lens of an unseen view.
+    near = torch.cdist(reach[:, None] * directions, centers - middle).amin(dim=1) < extent
+    reach = reach.masked_fill(near, far)
     if not known.any():
         known, past, sky = seen > 0, seen, total
     nearest = torch.cdist(sphere, sphere[known]).argmin(dim=1)
@@ -94,10 +98,10 @@ def background(scene: Scene, count: int) -> Cloud:
     return Cloud(middle + reach[:, None] * directions, colors)
 
 
-def _middle(scene: Scene) -> tuple[Float[Tensor, "3"], float]:
-    """Mean of the camera centres, and the scene extent: no camera is farther from it."""
+def _cameras(scene: Scene) -> tuple[Float[Tensor, "v 3"], float]:
+    """Centres of the training cameras, and the scene extent: none is farther from their mean."""
     viewmats = torch.stack([view.camera.viewmat for view in scene.train]).float()
-    return camera_center(viewmats).mean(dim=0), scene_extent(viewmats)
+    return camera_center(viewmats), scene_extent(viewmats)
 
 
 def _reach(

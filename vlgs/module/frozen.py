@@ -8,7 +8,8 @@ from torch import Tensor
 
 from vlgs.gaussians.parameters import LANGUAGE_SHAPE
 from vlgs.module.skips import SkipCount
-from vlgs.render.frozen import FrozenView, FrozenViews
+from vlgs.ops.frozen import FrozenView
+from vlgs.render.frozen import FrozenViews
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Camera, Shape
 

@@ -1,5 +1,5 @@
 """Gaussians and a camera to images."""
 
-from vlgs.render.rasterize import rasterize
+from vlgs.ops.rasterize import rasterize
 
 __all__ = ["rasterize"]

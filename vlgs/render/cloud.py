@@ -11,8 +11,9 @@ from torch import Tensor
 from vlgs.fusion import Fusion
 from vlgs.gaussians.parameters import with_level_indicators
 from vlgs.gaussians.ply import PLAIN, SH_COEFFICIENTS
-from vlgs.gaussians.sh import SH_C0, sh_to_rgb, view_color
+from vlgs.gaussians.sh import SH_C0, sh_to_rgb
 from vlgs.geometry import camera_center
+from vlgs.ops.view_color import view_color
 from vlgs.render.model import SplatModel
 from vlgs.types import Camera
 

@@ -9,10 +9,11 @@ from torch import Tensor, nn
 from vlgs.codec import Codec
 from vlgs.fusion import Fusion
 from vlgs.gaussians.parameters import activate
-from vlgs.gaussians.sh import sh_to_rgb, view_color
+from vlgs.gaussians.sh import sh_to_rgb
 from vlgs.geometry import camera_center
 from vlgs.indicator import Indicator
-from vlgs.render.rasterize import rasterize
+from vlgs.ops.rasterize import rasterize
+from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
 

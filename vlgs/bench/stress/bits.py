@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from vlgs import _csrc
 from vlgs.bench.stress.case import CannotRunError, Case, Verdict
 from vlgs.bench.stress.splats import make_splats, render_with_gradients, tensors_of
 from vlgs.bench.stress.training import make_module, train
+from vlgs.ops import machine
 
 THREADS = (1, 2, 3)
 """Three are more than a small machine has cores: one is always put aside in the middle of a tile."""
@@ -78,9 +78,11 @@ def on(isa: str) -> Callable[[bool], Verdict]:
 
     def threads_and_repeats(full: bool) -> Verdict:
         """1, 2 and 3 threads, five repeats each, on this instruction set: images, gradients and 200 training steps have the same bits."""
-        if isa not in _csrc.isas().split():
-            raise CannotRunError(f"this machine and this build have {_csrc.isas()}")
-        digests = measure(full) if isa == _csrc.isa() else _in_process(isa, full)
+        if isa not in machine.instruction_sets():
+            raise CannotRunError(
+                f"this machine and this build have {' '.join(machine.instruction_sets())}"
+            )
+        digests = measure(full) if isa == machine.instruction_set() else _in_process(isa, full)
         parts = [f"{len(set(runs))} of {len(runs)} {what}" for what, runs in digests.items()]
         passed = all(len(set(runs)) == 1 for runs in digests.values())
         return Verdict(f"different results: {', '.join(parts)}", passed)

@@ -15,7 +15,8 @@ from vlgs.blend.pose import slerp
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.mlp import MLP
 from vlgs.geometry import quat_to_rotmat
-from vlgs.losses import SSIM_C1, SSIM_C2, SSIM_SIGMA, masked_cosine, ssim
+from vlgs.losses import masked_cosine, ssim
+from vlgs.ops.ssim import C1, C2, SIGMA
 from vlgs.query.similarity import cosines
 
 
@@ -72,7 +73,7 @@ def similarity(full: bool) -> Verdict:
 def _ssim_by_definition(images: Sequence[Tensor]) -> Float[Tensor, "n n"]:
     """Every image with every image: means and covariances of every window, by one two-dimensional convolution each."""
     offsets = torch.arange(-5, 6, dtype=torch.float64)
-    taps = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    taps = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     window = torch.outer(taps, taps)[None, None] / taps.sum() ** 2
 
     def mean(x: Tensor) -> Tensor:
@@ -83,9 +84,9 @@ def _ssim_by_definition(images: Sequence[Tensor]) -> Float[Tensor, "n n"]:
     values = torch.empty(len(images), len(images), dtype=torch.float64)
     for i, j in combinations_with_replacement(range(len(images)), 2):
         cov = mean(images[i] * images[j]) - means[i] * means[j]
-        top = (2 * means[i] * means[j] + SSIM_C1) * (2 * cov + SSIM_C2)
-        spread = means[i] ** 2 + means[j] ** 2 + SSIM_C1
-        ratio = top / (spread * (variances[i] + variances[j] + SSIM_C2))
+        top = (2 * means[i] * means[j] + C1) * (2 * cov + C2)
+        spread = means[i] ** 2 + means[j] ** 2 + C1
+        ratio = top / (spread * (variances[i] + variances[j] + C2))
         values[i, j] = values[j, i] = ratio.mean()
     return values
 

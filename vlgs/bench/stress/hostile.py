@@ -20,7 +20,8 @@ from vlgs.bench.stress.splats import (
     same_bits,
     tensors_of,
 )
-from vlgs.render import cpu
+from vlgs.ops import project
+from vlgs.ops.blend import blend
 from vlgs.types import Camera, ChannelGroup, RasterConfig
 
 
@@ -68,7 +69,7 @@ def needles(full: bool) -> Verdict:
     config = RasterConfig()
     K = torch.tensor([[splats.focal, 0, 30.5], [0, splats.focal, 22.5], [0, 0, 1]]).double()
     camera = Camera(torch.eye(4), K, splats.width, splats.height)
-    got = cpu.project(splats.means, splats.quats, splats.scales, camera, config)
+    got = project.project(splats.means, splats.quats, splats.scales, camera, config)
     p, s, r = (got.ellipse[:, i].numpy().astype(np.longdouble) for i in range(3))
     xx, xy, yy = _conic(splats.means, splats.quats, splats.scales, splats.focal, config)
     error = np.stack([p * p - xx, -p * p * s - xy, p * p * s * s + r * r - yy])
@@ -249,9 +250,9 @@ def tight_bounds(full: bool) -> Verdict:
         splats = _ellipses(batch, seed=first).to(dtype)
         K = torch.tensor([[60.0, 0, 30.3], [0, 60.0, 19.9], [0, 0, 1]]).double()
         camera = Camera(torch.eye(4), K, splats.width, splats.height)
-        flat = cpu.project(splats.means, splats.quats, splats.scales, camera, config)
+        flat = project.project(splats.means, splats.quats, splats.scales, camera, config)
         group = ChannelGroup(torch.eye(batch, dtype=dtype), splats.weights[0])
-        drawn = cpu.blend(flat, [group], camera, config).images[0] > 0
+        drawn = blend(flat, [group], camera, config).images[0] > 0
         octaves, slack = _exponents(flat, splats.width, splats.height, torch.finfo(dtype).eps)
         limit = torch.log(splats.weights[0].double() / config.alpha_min)
         inside, outside = octaves < limit - slack, octaves > limit + slack
@@ -273,7 +274,7 @@ def _ellipses(n: int, seed: int):
     return replace(splats, scales=scales, means=splats.means + shift, weights=weight)
 
 
-def _exponents(flat: cpu.Splats, width: int, height: int, eps: float) -> tuple[Tensor, Tensor]:
+def _exponents(flat: project.Splats, width: int, height: int, eps: float) -> tuple[Tensor, Tensor]:
     """Exponent of every (pixel, Gaussian) in float64, and what rounding in the kernel's type may do to it."""
     mean, ellipse = flat.mean2d.double(), flat.ellipse.double()
     y, x = torch.meshgrid(

@@ -9,9 +9,9 @@ from typing import Any
 
 from rich.table import Table
 
-from vlgs import _csrc
 from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
 from vlgs.bench.stress.case import CannotRunError, Case
+from vlgs.ops.machine import instruction_set
 from vlgs.report.provenance import commit, same_code
 
 PASSED, FAILED, NOT_RUN = "passed", "FAILED", "not run"
@@ -47,7 +47,7 @@ def run_case(case: Case, full: bool) -> StressRow:
         measured, outcome = f"{type(error).__name__}: {error}", FAILED
     return StressRow(
         case.name, case.criterion, measured, outcome,
-        round(time.perf_counter() - wall, 1), round(sum(os.times()[:4]) - cpu, 1), _csrc.isa(), commit(),
+        round(time.perf_counter() - wall, 1), round(sum(os.times()[:4]) - cpu, 1), instruction_set(), commit(),
     )  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def run_cases(cases: Sequence[Case], full: bool, path: Path | None) -> list[Stre
     header = provenance(None)
     for each in ("isa", "commit", "seed"):  # a matter of the row, and of the cases
         del header[each]
-    known = _passed(path, commit(), _csrc.isa())
+    known = _passed(path, commit(), instruction_set())
     done = {case.name: known[case.name] for case in cases if case.name in known}
     for case in sorted(cases, key=lambda c: c.minutes):
         if case.name in done:
@@ -104,7 +104,7 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
 
 def show_table(rows: Sequence[StressRow]) -> Table:
     """Case, criterion, what was measured, how it came out; and how many were not run."""
-    table = Table(title=f"vlgs stress, {_csrc.isa()}", show_lines=True)
+    table = Table(title=f"vlgs stress, {instruction_set()}", show_lines=True)
     for name in ("case", "criterion", "measured", "outcome"):
         table.add_column(name)
     for row in rows:

@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
+from vlgs.ops.blend import blend
+from vlgs.ops.project import Splats, project
+from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered, Shape
 
 DEFAULT = RasterConfig()
 
@@ -67,15 +69,57 @@ def rasterize(
     camera = Camera(viewmat, K, width, height)
     check_camera(camera)
     if backend == "cpu":
-        from vlgs.render import cpu
-
-        return cpu.rasterize(means, quats, scales, groups, camera, config)
+        return _rasterize(means, quats, scales, groups, camera, config)
     if backend == "reference":
-        from vlgs.render import reference
+        from vlgs.ops import rasterize_reference
 
         _check_finite(means, quats, scales, groups)
-        return reference.rasterize(means, quats, scales, groups, camera, config)
+        return rasterize_reference.rasterize(means, quats, scales, groups, camera, config)
     raise ValueError(f"rasterize: backend must be 'cpu' or 'reference', got {backend!r}")
+
+
+def _rasterize(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    groups: Sequence[ChannelGroup],
+    camera: Camera,
+    config: RasterConfig,
+) -> Rendered:
+    """Project and blend; groups with a shape of their own in passes of their own."""
+    splats = project(means, quats, scales, camera, config)
+    if all(group.shape is None for group in groups):
+        return blend(splats, groups, camera, config)
+    images: list[Tensor] = [splats.mean2d] * len(groups)
+    alphas, visible = list(images), torch.zeros(len(means), dtype=torch.bool)
+    by_shape: dict[int, list[int]] = {}
+    for index, group in enumerate(groups):
+        by_shape.setdefault(id(group.shape), []).append(index)
+    for indices in by_shape.values():
+        own = _reshaped(splats, means, groups[indices[0]].shape, camera, config)
+        part = blend(own, [groups[i] for i in indices], camera, config)
+        for index, image, alpha in zip(indices, part.images, part.alphas, strict=True):
+            images[index], alphas[index] = image, alpha
+        visible |= part.visible
+    return Rendered(tuple(images), tuple(alphas), visible, splats.mean2d)
+
+
+def _reshaped(
+    splats: Splats,
+    means: Float[Tensor, "n 3"],
+    shape: Shape | None,
+    camera: Camera,
+    config: RasterConfig,
+) -> Splats:
+    """The same Gaussians with another covariance; centres stay one tensor, which gathers the gradients of all shapes."""
+    if shape is None:
+        return splats
+    try:
+        own = project(means, shape.quats, shape.scales, camera, config)
+    except ValueError as error:
+        raise ValueError(f"{error} of a group's own shape") from error
+    depth = torch.where(splats.depth > 0, own.depth, 0.0)
+    return Splats(splats.mean2d, own.ellipse, depth)
 
 
 @lru_cache(maxsize=64)
@@ -132,8 +176,10 @@ def check_tensors(
             raise ValueError(
                 f"rasterize: {name} must be float32 or float64 like means ({means.dtype}), got {tensor.dtype}"
             )
-        if tensor.device.type != "cpu":
-            raise ValueError(f"rasterize: {name} must be on the CPU, got {tensor.device}")
+        if tensor.device != means.device:
+            raise ValueError(
+                f"rasterize: {name} must be on the device of means ({means.device}), got {tensor.device}"
+            )
 
 
 def check_camera(camera: Camera) -> None:

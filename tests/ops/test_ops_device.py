@@ -1,0 +1,74 @@
+"""The seam: an operation goes where its tensors are, or says by name that nothing computes it there."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import vlgs.ops
+from vlgs.fusion.attention import CrossAttention, SelfAttention
+from vlgs.losses import l1_dssim, masked_mse, ssim_map
+from vlgs.ops.frozen import FrozenView
+from vlgs.ops.rasterize import rasterize
+from vlgs.ops.ssim import KERNELS
+from vlgs.ops.view_color import view_color
+from vlgs.types import Camera, ChannelGroup, RasterConfig
+
+
+def there(*shape: int) -> Tensor:
+    """On a device that has shapes and no numbers, which no machine lacks."""
+    return torch.zeros(*shape, device="meta")
+
+
+K = torch.tensor([[9.0, 0, 2], [0, 9, 2], [0, 0, 1]])
+GAUSSIANS = there(5, 3), there(5, 4), there(5, 3)
+CALLS: dict[str, Callable[[], object]] = {
+    "project": lambda: rasterize(
+        *GAUSSIANS, [ChannelGroup(there(5, 3), there(5))], torch.eye(4), K, 4, 4
+    ),
+    "view_color": lambda: view_color(there(5, 3), there(5, 3, 3), there(5, 3), torch.zeros(3), 1),
+    "attention": lambda: SelfAttention(2, 2).to("meta")(there(5, 2), there(5, 2)),
+    "attention of one modality to the other": lambda: CrossAttention(2, 2).to("meta")(
+        there(5, 2), there(5, 2)
+    ),
+    "squared_error": lambda: masked_mse(there(4, 5, 3), there(4, 5, 3)),
+    "ssim": lambda: ssim_map(there(4, 5, 3), there(4, 5, 3)),
+    "l1_dssim": lambda: l1_dssim(there(4, 5, 3), there(4, 5, 3)),
+    "project of a frozen view": lambda: FrozenView(
+        *GAUSSIANS, there(5), Camera(torch.eye(4), K, 4, 4), RasterConfig()
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_device_that_has_no_kernel_is_refused_with_the_file_that_would_hold_it(name: str):
+    operation = name.split()[0]
+    with pytest.raises(ValueError, match=f"{operation}: tensors must be on cpu, got meta") as error:
+        CALLS[name]()
+    assert f"vlgs/ops/{operation}_meta.py" in str(error.value)
+
+
+def test_tensors_of_two_devices_are_refused_by_name():
+    means, quats, scales = torch.zeros(5, 3), torch.ones(5, 4), there(5, 3)
+    group = ChannelGroup(torch.zeros(5, 3), torch.zeros(5))
+    with pytest.raises(
+        ValueError, match=r"scales must be on the device of means \(cpu\), got meta"
+    ):
+        rasterize(means, quats, scales, [group], torch.eye(4), K, 4, 4)
+
+
+def test_another_device_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "ssim_meta.py").write_text(
+        "from vlgs.ops.ssim import KERNELS\nKERNELS['meta'] = lambda a, b: a - b\n"
+    )
+    monkeypatch.setattr(vlgs.ops, "__path__", [*vlgs.ops.__path__, str(tmp_path)])
+    monkeypatch.setattr(KERNELS, "_by_device", dict(KERNELS._by_device))  # pyright: ignore[reportPrivateUsage]
+    try:
+        image = there(4, 5, 3)
+        assert ssim_map(image, image).shape == (4, 5, 3)
+        assert ssim_map(image, image).device.type == "meta"
+    finally:
+        sys.modules.pop("vlgs.ops.ssim_meta", None)
