@@ -87,9 +87,9 @@ def background(scene: Scene, count: int) -> Cloud:
     if not seen.any():  # cameras that see nothing of the sphere: of a huge focal length, or a principal point far out
         return Cloud(points[:0], points[:0])
     known = 2 * past > seen
-    reach = _reach(points - middle, directions).clamp_max(far).masked_fill(known, far)
+    reach = _reach(points - middle, directions).clamp(extent, far).masked_fill(known, far)
     # Near a camera it would stand before the lens of an unseen view.
-    near = torch.cdist(reach[:, None] * directions, centers - middle).amin(dim=1) < extent
+    near = torch.cdist(reach[:, None] * directions, centers - middle).amin(dim=1) < extent / 2
     reach = reach.masked_fill(near, far)
     if not known.any():
         known, past, sky = seen > 0, seen, total
