@@ -18,7 +18,6 @@ from omegaconf import DictConfig
 from vlgs.arguments import command_line, take_command_line
 from vlgs.command import check_command
 from vlgs.config import CONF, instantiate
-from vlgs.former import adopt
 from vlgs.identity import RESULTS_VERSION, identity
 from vlgs.places import tidy_sweep, write_config
 from vlgs.prepare import Scenes, doubts, make_stages, prepare, text_encoder
@@ -92,7 +91,6 @@ def run(config: DictConfig) -> int:
     ready = prepare(config)
     folder = RunFolder(Path(config.results) / "runs" / ready.run_id)
     note_run(folder.path)
-    adopt(folder, config, ready.content)
     if config.on_existing == "refuse" and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"

@@ -1,8 +1,6 @@
-"""Runs that are one run: with settings that move nothing, of a class that was moved, in a folder named by an older rule."""
+"""Runs that are one run: with settings that move nothing, of a class that was moved."""
 
-import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +10,6 @@ import pytest
 from safetensors.numpy import load_file
 from tiny_runs import TINY, composed
 
-from vlgs.former import former_id
-from vlgs.prepare import prepare
 from vlgs.run import run
 from vlgs.runs import RunFolder
 
@@ -57,26 +53,6 @@ def test_settings_that_are_no_part_of_an_id_move_nothing(whole: RunFolder, tmp_p
     again = only_run(tmp_path / "elsewhere")
     assert again.path.name == whole.path.name
     assert made(again) == made(whole)
-
-
-@pytest.mark.parametrize("finished", [True, False])
-def test_a_folder_with_its_former_name_is_gone_on_with(
-    whole: RunFolder, tmp_path: Path, finished: bool, capfd: pytest.CaptureFixture[str]
-):
-    config = composed(*SHORT, f"results={tmp_path}")
-    former = RunFolder(tmp_path / "runs" / former_id(config, prepare(config).content))
-    shutil.copytree(whole.path, former.path)
-    metrics = {**(whole.finished() or {}), "config_hash": former.path.name, "recipe": "a", "data_recipe": "b"}  # fmt: skip
-    former.metrics.write_text(json.dumps(metrics))
-    if not finished:
-        former.metrics.unlink()
-    written = sorted(former.checkpoint.iterdir())[-1].stat().st_mtime_ns
-    assert run(config) == 0
-    folder = only_run(tmp_path)
-    assert folder.path.name == whole.path.name
-    assert made(folder) == made(whole)
-    assert sorted(folder.checkpoint.iterdir())[-1].stat().st_mtime_ns == written  # nothing trained
-    assert ("already done" in capfd.readouterr().out) == finished
 
 
 def test_a_plugin_whose_class_is_moved_has_its_run(tmp_path: Path):

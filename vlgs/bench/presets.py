@@ -10,7 +10,6 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vlgs.config import CONF, check_config, check_targets, instantiate
-from vlgs.former import adopt
 from vlgs.identity import run_id
 from vlgs.known import options
 from vlgs.module.build import Parts, build_module
@@ -67,7 +66,6 @@ def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
         "fingerprint": scene.fingerprint,
     }
     folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint))
-    adopt(folder, config, scene.fingerprint)
     with folder.writing() as own:
         write_config(own.config, config)
         if fit(module, own, FitOptions(meta)) is not None:
