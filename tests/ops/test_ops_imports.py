@@ -1,0 +1,35 @@
+"""Only `vlgs.ops` imports the compiled kernel. An extension module is nothing to import-linter."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2] / "vlgs"
+
+
+def imports_the_kernel(source: str) -> bool:
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            names = {f"{node.module}.{alias.name}" for alias in node.names} | {node.module or ""}
+        elif isinstance(node, ast.Import):
+            names = {alias.name for alias in node.names}
+        else:
+            continue
+        if "vlgs._csrc" in names:
+            return True
+    return False
+
+
+def test_every_form_of_import_is_seen():
+    forms = ("from vlgs import _csrc", "import vlgs._csrc", "from vlgs._csrc import project")
+    assert all(map(imports_the_kernel, forms))
+    assert not imports_the_kernel("from vlgs import rasterize")
+
+
+def test_nobody_else_imports_the_kernel():
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.rglob("*.py")
+        if imports_the_kernel(path.read_text())
+    }
+    assert found
+    assert {name for name in found if not name.startswith("ops/")} == set()
