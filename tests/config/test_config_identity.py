@@ -178,8 +178,10 @@ def test_where_a_class_lies_and_what_it_is_called_change_no_id(tmp_path: Path):
         "fusion=none codec=identity blend=none",
         "augment=offline_sam features/encoder=dinov2",
     ]
+    # The finder of an editable install would lead to the package here instead of to the copy.
     code = f"""if True:
         import json, sys
+        sys.meta_path[:] = [f for f in sys.meta_path if f.__module__.startswith("_frozen_importlib")]
         from vlgs.command import composed
         from vlgs.identity import identity, run_id
         configs = [composed(overrides.split()) for overrides in {chosen}]
