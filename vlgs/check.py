@@ -14,9 +14,10 @@ from torch import Tensor
 from vlgs.arguments import take_command_line
 from vlgs.command import check_command
 from vlgs.config import CONF, LEVELS, check_config, instantiate
-from vlgs.data.colmap import ColmapSource, survey
+from vlgs.data.colmap import survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
 from vlgs.data.plausible import plausibility_warnings
+from vlgs.data.source import ColmapSource
 from vlgs.prepare import doubts, prepare, rehearse
 from vlgs.text import screen
 from vlgs.types import IGNORE_ID, Scene, View

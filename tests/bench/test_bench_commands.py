@@ -9,7 +9,7 @@ import pytest
 from vlgs.bench.__main__ import SUBCOMMANDS, main
 from vlgs.bench.growth import Point, run_growth
 from vlgs.bench.kernel import BOUND_RATE, SIZES, Figures, Job, Size, _elsewhere, run_kernel
-from vlgs.bench.sheet import read_sheet
+from vlgs.bench.sheet import provenance, read_sheet
 
 HEADER = {"command", "cpu", "cores", "isa", "load", "commit", "seed", "torch"}
 TIMES = {f"{way}_{what}" for way in ("forward", "backward") for what in ("ms", "q1", "q3", "cpu")}
@@ -104,3 +104,12 @@ def test_bad_input_is_one_line_and_status_1(tmp_path: Path, capsys: pytest.Captu
     assert "must be a run folder with a checkpoint" in capsys.readouterr().err
     assert main(["train", "--recipes", "soup", "--out", str(tmp_path)]) == 1
     assert "recipe must be one of default" in capsys.readouterr().err
+
+
+def test_a_header_repeats_the_command_without_the_folders_of_this_machine(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    given = ["vlgs.bench", "unseen", "--root", "/somewhere/else/data", "--override", "a=[b, c]"]
+    monkeypatch.setattr("sys.argv", given)
+    command = provenance(None)["command"]
+    assert command == "python -m vlgs.bench unseen --root data --override 'a=[b, c]'"

@@ -13,10 +13,11 @@ from PIL import Image
 
 from vlgs.config import CONF
 from vlgs.data.cache import PixelCache
-from vlgs.data.colmap import ColmapSource, load_scene, survey
+from vlgs.data.colmap import load_scene, survey
 from vlgs.data.faults import SceneError, errors
 from vlgs.data.language import find_mask_files
 from vlgs.data.lens import Lens
+from vlgs.data.source import ColmapSource
 from vlgs.data.sparse import SparseCamera
 from vlgs.types import IGNORE_ID, Scene
 

@@ -9,9 +9,10 @@ import torch
 from colmap_scenes import picture, write_scene
 from PIL import Image
 
-from vlgs.data.colmap import ColmapSource, load_scene, survey
+from vlgs.data.colmap import load_scene, survey
 from vlgs.data.faults import SceneError
 from vlgs.data.images import is_copy_of, open_photograph, read_photograph
+from vlgs.data.source import ColmapSource
 
 SIZE = (6, 4)
 

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from vlgs.check import check_scene
-from vlgs.data.colmap import ColmapSource, load_scene, survey
+from vlgs.data.colmap import load_scene, survey
 from vlgs.data.faults import errors
 from vlgs.data.labels import ObjectFolder, open_labels
 from vlgs.data.labels.objects import LabelledImage
+from vlgs.data.source import ColmapSource
 
 SHARED = Path(__file__).parents[2] / "../shared/data"
 needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason="no real data beside the checkout")

@@ -15,8 +15,9 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from vlgs.data.colmap import ColmapSource, survey
+from vlgs.data.colmap import survey
 from vlgs.data.faults import errors
+from vlgs.data.source import ColmapSource
 from vlgs.sfm import reconstruct as module
 from vlgs.sfm.__main__ import main
 from vlgs.sfm.compare import align, compare_poses

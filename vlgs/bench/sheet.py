@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -16,6 +17,7 @@ from rich.table import Table
 
 from vlgs.files import write_atomically
 from vlgs.ops.machine import instruction_set
+from vlgs.places import without_places
 from vlgs.report.provenance import commit, machine
 
 if TYPE_CHECKING:
@@ -45,7 +47,7 @@ def provenance(seed: int | None, **notes: object) -> dict[str, object]:
     """Who measured what: the lines above a CSV. Ask for it before measuring, so that the load is that of the others."""
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     return {
-        "command": " ".join(["python -m vlgs.bench", *sys.argv[1:]]),
+        "command": shlex.join(["python", "-m", "vlgs.bench", *without_places(sys.argv[1:])]),
         **machine(),
         "isa": instruction_set(),
         "load": f"{load} (one-minute average when it began)",

@@ -21,8 +21,9 @@ from rich.progress import (
 )
 
 from vlgs.config import instantiate
-from vlgs.data.colmap import ColmapSource, open_training_views
+from vlgs.data.colmap import open_training_views
 from vlgs.data.images import read_photograph
+from vlgs.data.source import ColmapSource
 from vlgs.data.views import ViewSource
 from vlgs.features.extractor import Extractor
 from vlgs.features.folder import FeatureFolder, pair_bytes
