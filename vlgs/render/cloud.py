@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fusion import Fusion
-from vlgs.gaussians.parameters import with_level_indicators
+from vlgs.gaussians.parameters import at_levels
 from vlgs.gaussians.ply import PLAIN, SH_COEFFICIENTS
 from vlgs.gaussians.sh import SH_C0, sh_to_rgb
 from vlgs.geometry import camera_center
@@ -30,7 +30,7 @@ class PointCloud:
     """Gaussians that are drawn as they are: colour with the opacity, codes with the indicator."""
 
     params: dict[str, Tensor]
-    """The keys of `vlgs.gaussians.PARAMETERS`, and `LANGUAGE_SHAPE` where the model has it."""
+    """Those of the model, by name."""
     notes: tuple[str, ...]
     """What a file of them says of itself; the first is `vlgs.gaussians.ply.PLAIN`."""
 
@@ -63,7 +63,7 @@ def point_cloud(model: SplatModel, cameras: Sequence[Camera], color: bool = True
     if color:
         notes.append("opacity: logit of what blends colour")
     else:
-        params["opacity_logits"] = with_level_indicators(params, None)["indicator_logits"].clone()
+        params["opacity_logits"] = at_levels(params["indicator_logits"], None).clone()
         notes = ["trained for language alone: colour is untrained, opacity is that of language"]
     if params["features"].any():
         levels = f", {model.levels} mask levels side by side" if model.levels > 1 else ""
