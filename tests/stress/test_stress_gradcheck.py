@@ -25,12 +25,13 @@ from vlgs.codec.identity import Identity
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
 from vlgs.fusion.mlp import MLP
+from vlgs.gaussians.attributes import STANDARD
+from vlgs.gaussians.logistic import logistic
 from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.indicator import ColourOpacity, Learned, PerLevel
 from vlgs.losses import (
-    Losses,
     l1_dssim,
     masked_cosine,
     masked_l1,
@@ -38,6 +39,7 @@ from vlgs.losses import (
     ssim,
     ssim_map,
 )
+from vlgs.objectives import Language
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
@@ -50,13 +52,16 @@ from vlgs.render import rasterize
 from vlgs.render.model import SplatModel
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
-AREAS = ("ops", "render", "losses", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
-"""What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up."""
+AREAS = ("ops", "render", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+"""What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {
     "vlgs.fusion.Fusion.__call__": "protocol",
     "vlgs.codec.Codec.encode": "protocol",
     "vlgs.codec.Codec.decode": "protocol",
+    "vlgs.gaussians.parameters.at_levels": "before training",
+    "vlgs.gaussians.parameters.complete": "before training",
+    "vlgs.gaussians.parameters.conform": "before training",
     "vlgs.query.Query.relevancy": "protocol",
     "vlgs.query.Query.__call__": "protocol",
     "vlgs.query.text.TextEncoder.encode": "protocol",
@@ -71,9 +76,6 @@ NO_GRADIENT = {
     "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
     "vlgs.gaussians.ply.read_ply": "from a file",
     "vlgs.gaussians.ply.parse_ply": "from a file",
-    "vlgs.gaussians.parameters.complete": "fills a file's gaps",
-    "vlgs.gaussians.parameters.with_language_shape": "placed once",
-    "vlgs.gaussians.parameters.with_level_indicators": "placed once",
     "vlgs.gaussians.sound.broken_rows": "a mask",
     "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
     "vlgs.render.model.ViewRender.detach": "takes the gradient away",
@@ -262,11 +264,11 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.losses.l1_dssim by both images, without a mask": lambda: (
         l1_dssim, [draw(*SIZE), 2 + draw(*SIZE, seed=1)]
     ),
-    "vlgs.losses.Losses.color_loss": lambda: (
-        lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
+    "vlgs.objectives.language.Language.of": lambda: both(Language("cos").of, VALID),
+    "vlgs.gaussians.logistic.logistic": lambda: (logistic, [draw(5, low=-20, high=20)]),
+    "vlgs.gaussians.attributes.Attribute.activate": lambda: (
+        STANDARD["log_scales"].activate, [draw(3, 3)]
     ),
-    "vlgs.losses.Losses.language_loss": lambda: both(Losses(lang_loss="cos").language_loss, VALID),
-    "vlgs.losses.Losses.blended_loss": lambda: both(Losses().blended_loss, VALID, 0.7),
     "vlgs.geometry.quat_to_rotmat": lambda: (quat_to_rotmat, [draw(4, 4)]),
     "vlgs.geometry.rotmat_to_quat": lambda: (rotmat_to_quat, [rotation]),
     "vlgs.geometry.camera_center": lambda: (camera_center, [draw(2, 4, 4)]),

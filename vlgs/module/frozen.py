@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.module.skips import SkipCount
 from vlgs.ops.frozen import FrozenView
 from vlgs.render.frozen import FrozenViews
 from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
+from vlgs.skip_count import SkipCount
 from vlgs.types import Camera, Shape
 
 
