@@ -190,11 +190,8 @@ def test_points_project_onto_pixels_of_their_colour(scene):
 
 
 def test_points_lie_on_the_surfaces_that_their_view_sees():
-    few = {**SMALL, "scene": "lookalikes"}
-    scene, taken = (
-        load_scene(**few),
-        studio.open_studio(Recipe(**few | {"scene": find_scene(few["scene"])})),
-    )
+    scene = load_scene("lookalikes", **SMALL)
+    taken = studio.open_studio(Recipe(find_scene("lookalikes"), **SMALL))
     assert len(scene.points) == 4000  # nothing of glass or steel here, so every candidate is kept
     for shot, points in zip(taken.train, scene.points.split(1000), strict=True):
         center = camera_center(shot.camera.viewmat.double()).numpy()[:, None]
