@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from vlgs.bench.stress.splats import SMOOTH, make_splats
+from tests.stress.splats import SMOOTH, make_splats
 from vlgs.blend import FixedBlend, blend_targets
 from vlgs.blend.pose import slerp
 from vlgs.codec.autoencoder import Autoencoder
