@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vlgs.bench.fuzz_layers import run_frozen, run_layers
 from vlgs.bench.fuzz_scene import POISON, FuzzScene, make_scene
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import Rendered
 
 NAMED = re.compile(r"^[A-Za-z]\w*: .+ must be .+, got ", re.DOTALL)

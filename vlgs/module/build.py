@@ -9,6 +9,7 @@ from torch import Tensor
 from vlgs.blend import ViewBlend
 from vlgs.codec import Codec
 from vlgs.codec.autoencoder import Autoencoder
+from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, initialise
@@ -20,7 +21,6 @@ from vlgs.losses import Losses
 from vlgs.module.lift import lift_features
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import TrainerConfig
-from vlgs.render.model import SplatModel
 from vlgs.types import RasterConfig, Scene
 
 log = logging.getLogger(__name__)

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields.frozen import FrozenViews
+from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.gaussians.parameters import LANGUAGE_SHAPE
 from vlgs.module.skips import SkipCount
 from vlgs.ops.frozen import FrozenView
-from vlgs.render.frozen import FrozenViews
-from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Camera, Shape
 
 GEOMETRY = frozenset({"means", "quats", "log_scales", *LANGUAGE_SHAPE})

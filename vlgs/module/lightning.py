@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
+from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
@@ -21,7 +22,6 @@ from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
 from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.settings import TrainerConfig
 from vlgs.module.skips import SkipCount
-from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.types import Scene, View
 
 TARGET_BYTES = 256 << 20
