@@ -142,6 +142,8 @@ class Gaussians:
     """Language code f; those of all mask levels side by side with ``levels=joint``."""
     language_shape: Shape | None = None
     """Covariance that language is blended with; None where it is colour's (``sharing=pos``, Table 17)."""
+    further: Mapping[str, Float[Tensor, "n _"]] = field(default_factory=dict)
+    """Further attributes by name, in natural units (``gaussians.attributes``)."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,10 @@
 import torch
 
 from vlgs.bench.alone import WIDTHS, measure_alone, show_alone
-from vlgs.gaussians.parameters import PARAMETERS
+from vlgs.gaussians import STANDARD
+
+PARAMETERS = tuple(STANDARD)[:8]
+"""What every training has."""
 
 
 def test_fusion_and_adam_are_timed_by_threads():

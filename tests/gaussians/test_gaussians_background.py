@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vlgs.gaussians import GaussiansConfig, initialise
+from vlgs.gaussians import GaussiansConfig, attributes_of, initialise
 from vlgs.gaussians.background import background, with_background
 from vlgs.geometry import camera_center, pose_matrix, scene_extent
 from vlgs.types import Camera, Scene, View
@@ -89,8 +89,9 @@ def test_no_background_stands_near_a_camera():
 def test_the_first_gaussians_stay_and_the_background_comes_after_them():
     toy = scene(shell(-5.0)[:1])
     config = GaussiansConfig(background=200)
-    first = initialise(toy, config, 3)
-    both = with_background(first, toy, config)
+    attributes = attributes_of(config, 3)
+    first = initialise(toy, config, attributes)
+    both = with_background(first, toy, config.background, attributes)
     for name, value in both.items():
         assert len(value) == len(first[name]) + 200
         assert torch.equal(value[: len(first[name])], first[name])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from vlgs.gaussians import (
-    PARAMETERS,
+    STANDARD,
     DensifyConfig,
     DensifyReport,
     DensifyState,
@@ -18,6 +18,9 @@ from vlgs.gaussians import (
     reset_opacity,
 )
 from vlgs.geometry import quat_to_rotmat
+
+PARAMETERS = tuple(STANDARD)[:8]
+"""What every training has."""
 
 EXTENT = 1.0
 SMALL, MIDDLE, LARGE = 0.005, 0.05, 0.5

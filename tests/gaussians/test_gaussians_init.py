@@ -9,12 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from vlgs.gaussians import PARAMETERS, GaussiansConfig, activate, initialise
+from vlgs.gaussians import GaussiansConfig, activate, attributes_of, initialise
 from vlgs.gaussians.neighbors import mean_squared_distance
 from vlgs.geometry import pose_matrix
 from vlgs.types import Camera, Scene, View
 
 GARDEN = Path(__file__).parents[2] / "../shared/data/gsplat_test_garden/test_garden.npz"
+
+
+def initialise_for(where: Scene, config: GaussiansConfig, width: int, seed: int = 0):
+    return initialise(where, config, attributes_of(config, width), seed)
 
 
 def camera_at(center: Tensor, forward: Tensor) -> Camera:
@@ -81,8 +85,8 @@ def test_neighbours_of_real_points():
 def test_hand_worked_start():
     points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2]])
     colors = torch.tensor([[255, 0, 51]], dtype=torch.uint8).repeat(4, 1)
-    params = initialise(scene(points, colors), GaussiansConfig(sh_degree=2), feature_dim=5)
-    assert tuple(params) == PARAMETERS
+    params = initialise_for(scene(points, colors), GaussiansConfig(sh_degree=2), 5)
+    assert list(params) == list(attributes_of(GaussiansConfig(), 5))
     assert {k: tuple(v.shape[1:]) for k, v in params.items()} == {
         "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (3,), "shN": (8, 3),
         "opacity_logits": (), "indicator_logits": (), "features": (5,),
@@ -103,7 +107,7 @@ def test_hand_worked_start():
 def test_scales_are_clamped_on_both_sides():
     near = torch.tensor([[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0], [0.0, 0.0, 1e-6]])
     lone = torch.tensor([[0.0, 900.0, 0.0]])
-    params = initialise(scene(torch.cat([near, lone])), GaussiansConfig(max_init_angle=0.05), 3)
+    params = initialise_for(scene(torch.cat([near, lone])), GaussiansConfig(max_init_angle=0.05), 3)
     scales = params["log_scales"].exp()
     torch.testing.assert_close(scales[:4], torch.full((4, 3), 1e-7**0.5))
     torch.testing.assert_close(scales[4], torch.full((3,), 0.05 * 903.0))
@@ -120,20 +124,20 @@ def test_unusable_points_are_left_out():
             [1.0, 0.0, 0.0],  # seen before
         ]
     )
-    params = initialise(scene(torch.cat([good, bad])), GaussiansConfig(), 3)
+    params = initialise_for(scene(torch.cat([good, bad])), GaussiansConfig(), 3)
     torch.testing.assert_close(params["means"], good)
     assert all(value.isfinite().all() for value in params.values())
 
 
 def test_one_point_is_enough():
-    params = initialise(scene(torch.zeros(1, 3)), GaussiansConfig(), 3)
+    params = initialise_for(scene(torch.zeros(1, 3)), GaussiansConfig(), 3)
     torch.testing.assert_close(params["log_scales"].exp(), torch.full((1, 3), 0.3))
 
 
 def test_too_many_points_are_thinned_by_seed():
     points = torch.rand(300, 3)
     config = GaussiansConfig(max_count=100)
-    first, again, other = (initialise(scene(points), config, 3, s)["means"] for s in (0, 0, 1))
+    first, again, other = (initialise_for(scene(points), config, 3, s)["means"] for s in (0, 0, 1))
     assert len(first) == 100
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
@@ -147,8 +151,8 @@ def test_without_points_random_ones_fill_what_the_cameras_share():
     cameras = [camera_at(middle + offset, -offset) for offset in around]
     before = torch.get_rng_state()
     config = GaussiansConfig(init_points=2000)
-    params = initialise(scene(torch.zeros(0, 3), cameras=cameras), config, 3)
-    again = initialise(scene(torch.zeros(0, 3), cameras=cameras), config, 3)
+    params = initialise_for(scene(torch.zeros(0, 3), cameras=cameras), config, 3)
+    again = initialise_for(scene(torch.zeros(0, 3), cameras=cameras), config, 3)
     assert torch.equal(before, torch.get_rng_state())
     assert torch.equal(params["means"], again["means"])
     assert params["means"].shape == (2000, 3)
@@ -157,8 +161,8 @@ def test_without_points_random_ones_fill_what_the_cameras_share():
 
 def test_bad_input():
     with pytest.raises(ValueError, match="must have training views"):
-        initialise(scene(torch.zeros(1, 3), cameras=[]), GaussiansConfig(), 3)
-    with pytest.raises(ValueError, match="feature_dim must be at least 1"):
-        initialise(scene(torch.zeros(1, 3)), GaussiansConfig(), 0)
+        initialise_for(scene(torch.zeros(1, 3), cameras=[]), GaussiansConfig(), 3)
+    with pytest.raises(ValueError, match="width of the language code must be at least 1"):
+        initialise_for(scene(torch.zeros(1, 3)), GaussiansConfig(), 0)
     with pytest.raises(ValueError, match="parameters must have"):
         activate({"means": torch.zeros(1, 3)})

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from vlgs.gaussians import PARAMETERS, read_ply, write_ply
+from vlgs.gaussians import STANDARD, attributes_of, read_ply, write_ply
 from vlgs.gaussians.config import GaussiansConfig
 from vlgs.interchange import (
     FORMATS,
@@ -24,6 +24,9 @@ from vlgs.interchange import (
     write_gaussians,
 )
 from vlgs.interchange.plain import load_plain
+
+PARAMETERS = tuple(STANDARD)[:8]
+"""What every training has."""
 
 
 def random_params(
@@ -324,7 +327,7 @@ def test_real_files_go_through_every_format(shared: Path, tmp_path: Path, name: 
 def test_a_run_starts_from_any_of_these(tmp_path: Path):
     values, iteration = reference_checkpoint(True)
     torch.save((values, iteration), tmp_path / "a.pth")
-    params = start_from(tmp_path / "a.pth", GaussiansConfig(sh_degree=2), 3)
+    params = start_from(tmp_path / "a.pth", attributes_of(GaussiansConfig(sh_degree=2), 3))
     assert params["shN"].shape == (2, 8, 3)
     assert torch.equal(params["shN"][:, :3], values[3])
     assert (params["shN"][:, 3:] == 0).all()
@@ -333,10 +336,9 @@ def test_a_run_starts_from_any_of_these(tmp_path: Path):
     rendered = feature / (feature.norm(dim=1, keepdim=True) + 1e-9)
     torch.testing.assert_close(params["features"], rendered)
     assert params["features"][0].tolist() != feature[0].tolist()
-    assert start_from(tmp_path / "a.pth", GaussiansConfig(sh_degree=0), 8)["features"].shape == (
-        2,
-        8,
-    )
+    assert start_from(tmp_path / "a.pth", attributes_of(GaussiansConfig(sh_degree=0), 8))[
+        "features"
+    ].shape == (2, 8)
     before = file_digest(tmp_path / "a.pth")
     write_ply(tmp_path / "a.pth", random_params())
     assert file_digest(tmp_path / "a.pth") != before
@@ -344,4 +346,4 @@ def test_a_run_starts_from_any_of_these(tmp_path: Path):
         file_digest(tmp_path / "none.ply")
     write_ply(tmp_path / "empty.ply", random_params(0))
     with pytest.raises(ValueError, match="must hold Gaussians, got none"):
-        start_from(tmp_path / "empty.ply", GaussiansConfig(), 3)
+        start_from(tmp_path / "empty.ply", attributes_of(GaussiansConfig(), 3))

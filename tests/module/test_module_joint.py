@@ -14,7 +14,8 @@ from vlgs.fields import HasGaussians
 from vlgs.fields.trained import SplatField
 from vlgs.gaussians import densify, read_ply, write_ply
 from vlgs.gaussians.densify import DensifyState
-from vlgs.gaussians.parameters import logit, with_level_indicators
+from vlgs.gaussians.logistic import logit
+from vlgs.gaussians.parameters import at_levels
 from vlgs.module.build import Parts, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.joint import join_levels
@@ -274,15 +275,12 @@ def test_ply_and_number_of_indicators(scenes: list[Scene], tmp_path: Path):
     write_ply(tmp_path / "a.ply", splats)
     back = read_ply(tmp_path / "a.ply")
     assert all(torch.equal(back[name], splats[name]) for name in splats)
-    one = {"indicator_logits": torch.full((4,), logit(0.3))}
-    several = with_level_indicators(one, 3)["indicator_logits"]
+    one = torch.full((4,), logit(0.3))
+    several = at_levels(one, 3)
     assert several.shape == (4, 3)
-    assert torch.equal(
-        with_level_indicators({"indicator_logits": several}, 3)["indicator_logits"], several
-    )
+    assert torch.equal(at_levels(several, 3), several)
     for levels in (None, 2):
-        again = with_level_indicators({"indicator_logits": several}, levels)["indicator_logits"]
-        torch.testing.assert_close(again.reshape(4, -1)[:, 0], one["indicator_logits"])
+        torch.testing.assert_close(at_levels(several, levels).reshape(4, -1)[:, 0], one)
 
 
 def test_kept_weights_render_all_levels(scenes: list[Scene]):

@@ -15,11 +15,14 @@ from tiny_runs import TINY, composed
 
 from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert, main
-from vlgs.gaussians import PARAMETERS, read_ply, write_ply
+from vlgs.gaussians import STANDARD, read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN
 from vlgs.interchange import write_autoencoder
 from vlgs.run import run
 from vlgs.types import Scene
+
+PARAMETERS = tuple(STANDARD)[:8]
+"""What every training has."""
 
 
 def some_gaussians(n: int = 40, width: int = 3) -> dict[str, torch.Tensor]:

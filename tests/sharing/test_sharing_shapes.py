@@ -13,11 +13,12 @@ from vlgs.gaussians import (
     DensifyState,
     GaussiansConfig,
     Sharing,
+    attributes_of,
+    conform,
     densify,
     read_ply,
     write_ply,
 )
-from vlgs.gaussians.parameters import with_language_shape
 from vlgs.module.build import Parts, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
@@ -171,7 +172,7 @@ def test_ply_keeps_both_shapes(tmp_path: Path):
     assert all(torch.equal(params[name], back[name]) for name in params)
     write_ply(tmp_path / "b.ply", params, "3dgs")
     assert "language_quats" not in read_ply(tmp_path / "b.ply")
-    assert with_language_shape(back, own=False).keys() == back.keys() - {
+    assert conform(back, attributes_of(GaussiansConfig(), 3)).keys() == back.keys() - {
         "language_quats",
         "language_log_scales",
     }

@@ -70,7 +70,7 @@ class PointCloud:
     """Gaussians that are drawn as they are: colour with the opacity, codes with the indicator."""
 
     params: dict[str, Tensor]
-    """The keys of `vlgs.gaussians.PARAMETERS`, and `LANGUAGE_SHAPE` where the field has it."""
+    """Raw parameters by name, see `vlgs.gaussians.attributes`."""
     notes: tuple[str, ...]
     """What a file of them says of itself; the first is `vlgs.gaussians.ply.PLAIN`."""
 

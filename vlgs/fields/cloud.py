@@ -11,7 +11,7 @@ from torch import Tensor
 from vlgs.fields import Field, HasGaussians, PointCloud
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
-from vlgs.gaussians.parameters import with_level_indicators
+from vlgs.gaussians.parameters import at_levels
 from vlgs.gaussians.ply import PLAIN, SH_COEFFICIENTS, write_ply
 from vlgs.gaussians.sh import SH_C0, sh_to_rgb
 from vlgs.geometry import camera_center
@@ -69,7 +69,7 @@ def point_cloud(model: SplatModel, cameras: Sequence[Camera], color: bool = True
     if color:
         notes.append("opacity: logit of what blends colour")
     else:
-        params["opacity_logits"] = with_level_indicators(params, None)["indicator_logits"].clone()
+        params["opacity_logits"] = at_levels(params["indicator_logits"], None).clone()
         notes = ["trained for language alone: colour is untrained, opacity is that of language"]
     if params["features"].any():
         levels = f", {model.levels} mask levels side by side" if model.levels > 1 else ""

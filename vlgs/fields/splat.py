@@ -1,6 +1,7 @@
 """A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,7 +9,7 @@ from torch import Tensor, nn
 
 from vlgs.codec import Codec
 from vlgs.fusion import Fusion
-from vlgs.gaussians.parameters import activate
+from vlgs.gaussians import STANDARD, Attributes, activate
 from vlgs.gaussians.sh import sh_to_rgb
 from vlgs.geometry import camera_center
 from vlgs.indicator import Indicator
@@ -42,18 +43,22 @@ class ViewRender:
     alpha_language: Float[Tensor, "h w *levels"] | None
     visible: Bool[Tensor, " n"]
     mean2d: Float[Tensor, "n 2"]
+    further: Mapping[str, Float[Tensor, "h w _"]] = field(default_factory=dict)
+    """Further attributes that were asked for, by name."""
 
     def detach(self) -> "ViewRender":
         """The same pixels, from which no gradient can be asked."""
-        tensors = ((f.name, getattr(self, f.name)) for f in fields(self))
-        return replace(self, **{name: t.detach() for name, t in tensors if t is not None})
+        values = ((f.name, getattr(self, f.name)) for f in fields(self))
+        tensors = {name: t.detach() for name, t in values if isinstance(t, Tensor)}
+        further = {name: image.detach() for name, image in self.further.items()}
+        return replace(self, **tensors, further=further)
 
 
 class SplatModel(nn.Module):
     """A trained scene: the parameters in a checkpoint, and everything that is needed to render.
 
     Args:
-        parameters: Raw Gaussians, the keys of `vlgs.gaussians.PARAMETERS`, with or without `LANGUAGE_SHAPE`.
+        parameters: Raw Gaussians, by the names of `attributes`.
         fusion: Mixes colour and language of each Gaussian (Eq. 5).
         indicator: Chooses what blends language (Eq. 6).
         codec: Embedding to language code and back.
@@ -61,6 +66,7 @@ class SplatModel(nn.Module):
         sh_degree: Highest spherical harmonics degree in use, 0 to 3.
         evaluated: Whether colour is fused as each view sees it, so that what is blended as language depends on the view
             (``gaussians.color=evaluated``, conf/README.md, D.7); questions in 3D are then asked of the fusion with degree 0.
+        attributes: What a Gaussian carries.
     """
 
     def __init__(
@@ -72,6 +78,7 @@ class SplatModel(nn.Module):
         raster: RasterConfig,
         sh_degree: int,
         evaluated: bool = False,
+        attributes: Attributes = STANDARD,
     ) -> None:
         super().__init__()
         self.splats = nn.ParameterDict({k: nn.Parameter(v) for k, v in parameters.items()})
@@ -81,6 +88,7 @@ class SplatModel(nn.Module):
         self.raster = raster
         self.sh_degree = sh_degree
         self.evaluated = evaluated
+        self.attributes = attributes
 
     @property
     def count(self) -> int:
@@ -94,7 +102,7 @@ class SplatModel(nn.Module):
 
     def gaussians(self) -> Gaussians:
         """The Gaussians in natural units."""
-        return activate(self.splats)
+        return activate(self.splats, self.attributes)
 
     def fuse(self) -> FusedGaussians:
         """Activate and fuse all Gaussians; once per iteration, however many views are rendered."""
@@ -108,19 +116,21 @@ class SplatModel(nn.Module):
         color: bool = True,
         language: bool = True,
         fused: FusedGaussians | None = None,
+        further: Sequence[str] = (),
     ) -> ViewRender:
-        """Render colour, language or both in one pass over the tiles.
+        """Render colour, language and further attributes in one pass over the tiles.
 
         Args:
             camera: Where to look from.
             color: Whether colour is wanted.
             language: Whether language is wanted.
             fused: Result of `fuse`, when several views share it.
+            further: Names of further attributes that are wanted (``gaussians.attributes``).
 
         Raises:
-            ValueError: If neither modality is wanted, or a Gaussian is not finite.
+            ValueError: If nothing is wanted, a further attribute cannot be drawn, or a Gaussian is not finite.
         """
-        if not (color or language):
+        if not (color or language or further):
             raise ValueError("render: color or language must be true, got neither")
         fused = self.fuse() if fused is None else fused
         groups, values, feature = [], None, fused.feature
@@ -133,12 +143,14 @@ class SplatModel(nn.Module):
             groups.append(ChannelGroup(values, fused.gaussians.opacities))
         if language:
             groups += _language_groups(feature, fused)
+        before = len(groups)
+        groups += [self._group(name, fused) for name in further]
         out = self._rasterize(fused.gaussians, groups, camera)
-        seen, alpha = out.images[-1], out.alphas[-1]
+        seen, alpha = out.images[before - 1], out.alphas[before - 1]
         if language and fused.language_weight.dim() == 2:
             levels = fused.language_weight.shape[1]
-            seen = torch.cat(out.images[-levels:], dim=-1)
-            alpha = torch.stack(out.alphas[-levels:], dim=-1)
+            seen = torch.cat(out.images[before - levels : before], dim=-1)
+            alpha = torch.stack(out.alphas[before - levels : before], dim=-1)
         return ViewRender(
             color=out.images[0] if color else None,
             feature=seen if language else None,
@@ -146,6 +158,24 @@ class SplatModel(nn.Module):
             alpha_language=alpha if language else None,
             visible=out.visible,
             mean2d=out.mean2d,
+            further=dict(zip(further, out.images[before:], strict=True)),
+        )
+
+    def _group(self, name: str, fused: FusedGaussians) -> ChannelGroup:
+        """What draws a further attribute."""
+        row, values = self.attributes.get(name), fused.gaussians.further
+        weight = fused.gaussians.opacities
+        if row is None or name not in values or row.blended_by is None:
+            drawn = [n for n in values if self.attributes[n].blended_by is not None]
+            raise ValueError(f"render: {name} must be one of {drawn}, got no such attribute")
+        if row.blended_by == "opacity_logits":
+            return ChannelGroup(values[name], weight, row.shape_grad)
+        if fused.language_weight.dim() == 2:
+            raise ValueError(
+                f"render: {name} must be blended by the opacity with indicator=per_level"
+            )
+        return ChannelGroup(
+            values[name], fused.language_weight, row.shape_grad, fused.gaussians.language_shape
         )
 
     def render_values(

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from vlgs.gaussians.config import GaussiansConfig
+from vlgs.gaussians.attributes import Attributes
 from vlgs.gaussians.init import Cloud, parameters_of
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
@@ -35,7 +35,7 @@ MAX_NEAR = 1 << 14
 
 
 def with_background(
-    parameters: dict[str, Tensor], scene: Scene, config: GaussiansConfig
+    parameters: dict[str, Tensor], scene: Scene, count: int, attributes: Attributes
 ) -> dict[str, Tensor]:
     """The first Gaussians and, behind them, round ones all around cameras and scene.
 
@@ -44,15 +44,16 @@ def with_background(
     Args:
         parameters: From `initialise`.
         scene: Its training views and sparse points.
-        config: `background` directions all around.
+        count: Directions all around.
+        attributes: What the Gaussians carry.
     """
-    sphere = background(scene, config.background)
+    sphere = background(scene, count)
     if len(sphere.points) == 0:
         return parameters
     middle = _cameras(scene)[0].mean(dim=0)
     # The distance of neighbours on a sphere of this many directions.
-    scales = (sphere.points - middle).norm(dim=1) * math.sqrt(4 * math.pi / config.background)
-    behind = parameters_of(sphere, scales, config, parameters["features"].shape[1])
+    scales = (sphere.points - middle).norm(dim=1) * math.sqrt(4 * math.pi / count)
+    behind = parameters_of(sphere, scales, attributes)
     return {name: torch.cat([value, behind[name]]) for name, value in parameters.items()}
 
 

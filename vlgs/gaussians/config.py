@@ -1,7 +1,8 @@
 """Settings of the Gaussians: how they start, multiply and die. Mirrored by conf/gaussians."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 from vlgs.values import require_range
 
@@ -60,6 +61,31 @@ class DensifyConfig:
 
 
 @dataclass(frozen=True)
+class AttributeConfig:
+    """A further attribute of every Gaussian: carried, trained, densified, saved, written to PLY files, and drawn on demand."""
+
+    width: int
+    """How many numbers a Gaussian has of it."""
+    activation: Literal["none", "exp", "logistic"] = "none"
+    """From the raw parameter to what is drawn."""
+    start: float = 0.0
+    """Raw value of all Gaussians at the start."""
+    rate: float = 2.5e-3
+    """Adam's rate; 0: it does not learn."""
+    blended_by: Literal["opacity", "indicator"] | None = "opacity"
+    """The weight that blends it into an image; None: it is not drawn."""
+    shape_grad: bool = True
+    """Whether the gradient of its image reaches positions, rotations and scales."""
+
+    def __post_init__(self) -> None:
+        require_range("attribute", 1, 4096, width=self.width)
+        require_range("attribute", 0, 1, rate=self.rate)
+        require_range("attribute", -1e6, 1e6, start=self.start)
+        _require_choice("attribute", "activation", self.activation, ("none", "exp", "logistic"))
+        _require_choice("attribute", "blended_by", self.blended_by, ("opacity", "indicator", None))
+
+
+@dataclass(frozen=True)
 class GaussiansConfig:
     """Which values each Gaussian has, and how they start."""
 
@@ -92,6 +118,8 @@ class GaussiansConfig:
     """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (conf/README.md, D.11)."""
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    """Name -> what every Gaussian carries besides: an `AttributeConfig`, or a mapping of its values."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
 
     def __post_init__(self) -> None:
@@ -114,15 +142,32 @@ class GaussiansConfig:
             "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
         }.items():
-            if getattr(self, name) not in options:
-                raise ValueError(
-                    f"gaussians: {name} must be {' or '.join(options)}, got {getattr(self, name)}"
-                )
+            _require_choice("gaussians", name, getattr(self, name), options)
+
+        further = {name: _attribute(name, extra) for name, extra in self.attributes.items()}
+        object.__setattr__(self, "attributes", further)
 
     @property
     def degree(self) -> int:
         """Spherical harmonics degree that the Gaussians have: none with ``color=rgb``."""
         return 0 if self.color == "rgb" else self.sh_degree
+
+
+def _attribute(name: str, extra: Any) -> AttributeConfig:
+    if isinstance(extra, AttributeConfig):
+        return extra
+    known = [key.name for key in fields(AttributeConfig)]
+    if not isinstance(extra, Mapping) or "width" not in extra or set(extra) - set(known):
+        got = list(extra) if isinstance(extra, Mapping) else extra
+        raise ValueError(
+            f"gaussians: attributes.{name} must have a width and some of {', '.join(known[1:])}, got {got}"
+        )
+    return AttributeConfig(**{str(key): value for key, value in extra.items()})
+
+
+def _require_choice(who: str, name: str, value: object, choices: tuple[str | None, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{who}: {name} must be {' or '.join(map(str, choices))}, got {value}")
 
 
 def _require_at_least(who: str, least: int, **values: int) -> None:

@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from vlgs.gaussians.attributes import STANDARD, Attributes, Role
 from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.init import distance_to_nearest, seeded_generator
-from vlgs.gaussians.parameters import logit
+from vlgs.gaussians.logistic import logit
+from vlgs.gaussians.parameters import Parameters
 from vlgs.geometry import quat_to_rotmat
 
 log = logging.getLogger(__name__)
@@ -105,6 +107,7 @@ def densify(
     seed: int,
     step: int,
     centers: Float[Tensor, "v 3"] | None = None,
+    attributes: Attributes = STANDARD,
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
@@ -121,6 +124,7 @@ def densify(
         seed: Of the run.
         step: Of the run; large Gaussians are spared until the first opacity reset has passed.
         centers: Of the training cameras; what is `BACKGROUND` away from all of them may be large. None: nothing may.
+        attributes: The table of `params`.
 
     Raises:
         ValueError: If `state` has another size than `params`, or no Gaussian is finite.
@@ -129,14 +133,14 @@ def densify(
     if state.grad_sum.shape[0] != n:
         raise ValueError(f"densify: state must have {n} rows, got {state.grad_sum.shape[0]}")
     with torch.no_grad():
-        dead = _dead(params, config)
+        dead = _dead(params, config, attributes)
         grow = _hot(state, config) & ~dead
         grow = _highest(grow, state.mean(), config.max_count - int((~dead).sum()))
-        small = _largest_scale(params) <= config.densify.dense_share * extent
+        small = _largest_scale(params, attributes) <= config.densify.dense_share * extent
         rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
         values = {name: value[rows.source] for name, value in params.items()}
-        _place_children(values, rows, seeded_generator("densify", seed, step))
-        kept = _not_large(values, config, extent, step, centers)
+        _place_children(values, rows, seeded_generator("densify", seed, step), attributes)
+        kept = _not_large(values, config, extent, step, centers, attributes)
         if not kept.all():
             rows, values = rows[kept], {name: value[kept] for name, value in values.items()}
     _replace(params, optimizer, values, rows)
@@ -162,7 +166,9 @@ def reset_opacity(
             moment.zero_()
 
 
-def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
+def _dead(
+    params: nn.ParameterDict, config: GaussiansConfig, attributes: Attributes
+) -> Bool[Tensor, " n"]:
     """Gaussians that are too faint to matter, and those with broken parameters."""
     indicator, opacity = params["indicator_logits"].sigmoid(), params["opacity_logits"].sigmoid()
     if indicator.dim() == 2:  # one level that needs a Gaussian keeps it
@@ -171,10 +177,9 @@ def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n
     if config.prune_on == "max":
         weight = weight.maximum(indicator)
     # A scale that overflows and a rotation of length zero are as broken as a NaN.
-    finite = _largest_scale(params).isfinite()
-    for name in ("quats", "language_quats"):
-        if name in params:
-            finite &= params[name].norm(dim=1) > 0
+    finite = _largest_scale(params, attributes).isfinite()
+    for quats in _having(params, attributes, "rotation"):
+        finite &= quats.norm(dim=1) > 0
     for value in params.values():
         finite &= value.isfinite().flatten(1).all(dim=1) if value.dim() > 1 else value.isfinite()
     if not finite.any():
@@ -225,7 +230,9 @@ def _next_generation(
     return _Rows(torch.cat([survivors, clones, children]), fresh, child)
 
 
-def _place_children(values: dict[str, Tensor], rows: _Rows, generator: torch.Generator) -> None:
+def _place_children(
+    values: dict[str, Tensor], rows: _Rows, generator: torch.Generator, attributes: Attributes
+) -> None:
     """Draw the centres of the children from their parent and shrink them, in place."""
     log_scales = values["log_scales"][rows.child]
     offsets = log_scales.exp() * torch.randn(
@@ -233,17 +240,17 @@ def _place_children(values: dict[str, Tensor], rows: _Rows, generator: torch.Gen
     )
     rotation = quat_to_rotmat(values["quats"][rows.child])
     values["means"][rows.child] += (rotation @ offsets[..., None]).squeeze(-1)
-    for name in ("log_scales", "language_log_scales"):
-        if name in values:
-            values[name][rows.child] -= math.log(SHRINK)
+    for scales in _having(values, attributes, "scale"):
+        scales[rows.child] -= math.log(SHRINK)
 
 
-def _largest_scale(params: nn.ParameterDict | Mapping[str, Tensor]) -> Float[Tensor, " n"]:
+def _having(params: Parameters, attributes: Attributes, role: Role) -> list[Tensor]:
+    return [value for name, value in params.items() if attributes[name].role == role]
+
+
+def _largest_scale(params: Parameters, attributes: Attributes) -> Float[Tensor, " n"]:
     """Of colour's shape and, where it has one, of language's."""
-    log_scales = params["log_scales"]
-    if "language_log_scales" in params:
-        log_scales = torch.cat([log_scales, params["language_log_scales"]], dim=1)
-    return log_scales.amax(dim=1).exp()
+    return torch.cat(_having(params, attributes, "scale"), dim=1).amax(dim=1).exp()
 
 
 def _not_large(
@@ -252,13 +259,14 @@ def _not_large(
     extent: float,
     step: int,
     centers: Float[Tensor, "v 3"] | None,
+    attributes: Attributes,
 ) -> Bool[Tensor, " n"]:
     """Gaussians that stay, once large ones are looked for.
 
     3DGS also names a radius of 20 px on the screen; its code as released clears the radii just before it looks at
     them, so that only the size in the world ever counted. That is what is done here, but a background may be large.
     """
-    largest, first_reset = _largest_scale(values), config.densify.reset_every
+    largest, first_reset = _largest_scale(values, attributes), config.densify.reset_every
     if not config.densify.prune_large or first_reset == 0 or step <= first_reset:
         return torch.ones_like(largest, dtype=torch.bool)
     large = largest > config.densify.max_scale_share * extent

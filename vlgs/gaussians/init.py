@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from vlgs.gaussians.attributes import Attributes
 from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.neighbors import mean_squared_distance
-from vlgs.gaussians.parameters import logit
+from vlgs.gaussians.parameters import conform
 from vlgs.gaussians.sh import rgb_to_sh
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
@@ -38,9 +39,9 @@ class Cloud:
 
 
 def initialise(
-    scene: Scene, config: GaussiansConfig, feature_dim: int, seed: int = 0
+    scene: Scene, config: GaussiansConfig, attributes: Attributes, seed: int = 0
 ) -> dict[str, Tensor]:
-    """Raw parameters of the first Gaussians (as in 3DGS), keyed by `PARAMETERS`.
+    """Raw parameters of the first Gaussians (as in 3DGS).
 
     Each sparse point becomes an isotropic Gaussian whose variance is the mean squared distance to its three nearest
     neighbours, clamped at 1e-7 below and by `GaussiansConfig.max_init_angle` above. Non-finite points, points on a
@@ -49,17 +50,15 @@ def initialise(
 
     Args:
         scene: With at least one training view.
-        config: What the Gaussians carry.
-        feature_dim: Width d of the language code, which starts at zero here (conf/README.md, D.9).
+        config: How many points there may be, and how large.
+        attributes: What the Gaussians carry, and how it starts where points say nothing; codes at zero (conf/README.md, D.9).
         seed: Decides the random points, and which ones are kept when there are more than `max_count`.
 
     Raises:
-        ValueError: If there is no training view or `feature_dim` is not positive.
+        ValueError: If there is no training view.
     """
     if not scene.train:
         raise ValueError(f"gaussians: scene {scene.name} must have training views, got none")
-    if feature_dim < 1:
-        raise ValueError(f"gaussians: feature_dim must be at least 1, got {feature_dim}")
     cameras = [view.camera for view in scene.train]
     centers = camera_center(torch.stack([camera.viewmat for camera in cameras])).float()
     generator = seeded_generator("initialise", seed, 0)
@@ -74,7 +73,7 @@ def initialise(
             : config.max_count
         ].sort()[0]
         cloud = Cloud(cloud.points[kept], cloud.colors[kept])
-    return parameters_of(cloud, _initial_scales(cloud.points, centers, config), config, feature_dim)
+    return parameters_of(cloud, _initial_scales(cloud.points, centers, config), attributes)
 
 
 def seeded_generator(purpose: str, seed: int, step: int) -> torch.Generator:
@@ -87,22 +86,19 @@ def seeded_generator(purpose: str, seed: int, step: int) -> torch.Generator:
 
 
 def parameters_of(
-    cloud: Cloud, scales: Float[Tensor, " n"], config: GaussiansConfig, feature_dim: int
+    cloud: Cloud, scales: Float[Tensor, " n"], attributes: Attributes
 ) -> dict[str, Tensor]:
     """Raw parameters of round Gaussians of these scales."""
     n = cloud.points.shape[0]
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
-    return {
+    given = {
         "means": cloud.points.clone(),
         "quats": quats,
         "log_scales": scales.log()[:, None].repeat(1, 3),
         "sh0": rgb_to_sh(cloud.colors),
-        "shN": torch.zeros(n, (config.degree + 1) ** 2 - 1, 3),
-        "opacity_logits": torch.full((n,), logit(config.init_opacity)),
-        "indicator_logits": torch.full((n,), logit(config.init_indicator)),
-        "features": torch.zeros(n, feature_dim),
     }
+    return conform(given, attributes)
 
 
 def _usable(cloud: Cloud, centers: Float[Tensor, "v 3"]) -> Cloud:

@@ -1,123 +1,107 @@
-"""The raw parameters that the optimiser moves, and what they stand for."""
+"""The raw parameters that the optimiser moves, by the names of a table of attributes, and what they stand for."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
+from vlgs.gaussians.attributes import STANDARD, THREE_DGS, Attribute, Attributes
 from vlgs.types import Gaussians, Shape
 
-PARAMETERS = (
-    "means",
-    "quats",
-    "log_scales",
-    "sh0",
-    "shN",
-    "opacity_logits",
-    "indicator_logits",
-    "features",
-)
-"""Keys of the raw parameters: means [n, 3], quats [n, 4], log_scales [n, 3], sh0 [n, 3], shN [n, s, 3],
-opacity_logits [n], indicator_logits [n] ([n, levels] with ``indicator=per_level``), features [n, d]. Row i of every one of them is
-Gaussian i."""
-
-LANGUAGE_SHAPE = ("language_quats", "language_log_scales")
-"""Keys of the second covariance, for language, which exist with ``sharing=pos`` only: [n, 4] and [n, 3]."""
+Parameters = nn.ParameterDict | Mapping[str, Tensor]
+"""Name of an attribute -> [n, ...]; row i of every one of them is Gaussian i."""
 
 
-def activate(params: nn.ParameterDict | Mapping[str, Tensor]) -> Gaussians:
+def activate(params: Parameters, attributes: Attributes = STANDARD) -> Gaussians:
     """Gaussians in natural units: scales by exp, opacities and indicators by the logistic function.
 
     Args:
-        params: Raw parameters, the keys of `PARAMETERS`.
+        params: Raw parameters: those of 3DGS, `features`, `indicator_logits`, and what else the table has.
+        attributes: The table.
 
     Raises:
         ValueError: If a key is missing.
     """
-    missing = [name for name in PARAMETERS if name not in params]
+    needed = [*THREE_DGS, "features", "indicator_logits"]
+    missing = [name for name in needed if name not in params]
     if missing:
-        raise ValueError(
-            f"gaussians: parameters must have {', '.join(PARAMETERS)}, got no {missing}"
-        )
+        raise ValueError(f"gaussians: parameters must have {', '.join(needed)}, got no {missing}")
+    natural = {name: attributes[name].activate(value) for name, value in params.items()}
+    shape = None
+    if "language_quats" in natural:
+        shape = Shape(natural["language_quats"], natural["language_log_scales"])
     return Gaussians(
-        means=params["means"],
-        quats=params["quats"],
-        scales=params["log_scales"].exp(),
-        opacities=_logistic(params["opacity_logits"]),
-        indicators=_logistic(params["indicator_logits"]),
-        sh0=params["sh0"],
-        shN=params["shN"],
-        features=params["features"],
-        language_shape=_language_shape(params),
+        means=natural["means"],
+        quats=natural["quats"],
+        scales=natural["log_scales"],
+        opacities=natural["opacity_logits"],
+        indicators=natural["indicator_logits"],
+        sh0=natural["sh0"],
+        shN=natural["shN"],
+        features=natural["features"],
+        language_shape=shape,
+        further={name: value for name, value in natural.items() if name not in STANDARD},
     )
 
 
-def _language_shape(params: nn.ParameterDict | Mapping[str, Tensor]) -> Shape | None:
-    if "language_quats" not in params:
-        return None
-    return Shape(params["language_quats"], params["language_log_scales"].exp())
+def conform(params: Parameters, attributes: Attributes) -> dict[str, Tensor]:
+    """The same Gaussians with the attributes of a table, in its order.
+
+    What the table lacks goes; what the Gaussians lack starts as the table says. Harmonics are cut or filled with zeros, weights of other
+    mask levels become equal ones (`at_levels`), and a value of another width starts anew.
+
+    Args:
+        params: With `means` at least.
+        attributes: The table.
+    """
+    made: dict[str, Tensor] = {}
+    for name, row in attributes.items():
+        made[name] = _fitted(row, params[name]) if name in params else _started(row, made, params)
+    return made
 
 
-def with_language_shape(params: Mapping[str, Tensor], own: bool) -> dict[str, Tensor]:
-    """The same Gaussians with, or without, covariances of their own for language; they start as colour's."""
-    shared = {name: value for name, value in params.items() if name not in LANGUAGE_SHAPE}
-    if not own:
-        return shared
-    started = {f"language_{name}": params[name].clone() for name in ("quats", "log_scales")}
-    return shared | {name: params.get(name, started[name]) for name in LANGUAGE_SHAPE}
+def complete(params: Parameters, width: int) -> dict[str, Tensor]:
+    """What the file of another system holds, and language's code and indicator where it has none: zeros, and the opacity.
+
+    Args:
+        params: Those of 3DGS and any other of `STANDARD`.
+        width: Of the language code where there is none.
+    """
+    absent = {"features": replace(STANDARD["features"], shape=(width,))}
+    absent |= {"indicator_logits": replace(STANDARD["indicator_logits"], shape=())}
+    table = {n: row for n, row in STANDARD.items() if n in params or n in absent}
+    return conform(params, table | {n: row for n, row in absent.items() if n not in params})
 
 
-def with_level_indicators(params: Mapping[str, Tensor], levels: int | None) -> dict[str, Tensor]:
-    """The same Gaussians with an indicator for each of so many mask levels, or with one for all.
+def at_levels(
+    logits: Float[Tensor, " n *levels"], levels: int | None
+) -> Float[Tensor, " n *asked"]:
+    """Weights of so many mask levels, or one for all.
 
     One becomes several equal ones; several become one by the mean of their logits, as do those of another number of levels.
     """
-    logits = params["indicator_logits"]
     if logits.dim() == 2 and logits.shape[1] != levels:
         logits = logits.mean(dim=1)
     if logits.dim() == 1 and levels is not None:
         logits = logits[:, None].repeat(1, levels)
-    return {**params, "indicator_logits": logits}
+    return logits
 
 
-def complete(params: Mapping[str, Tensor], feature_dim: int) -> dict[str, Tensor]:
-    """All of `PARAMETERS`, in order, of what another system's file holds, and `LANGUAGE_SHAPE` where it is there.
-
-    Args:
-        params: Without `indicator_logits` the opacity's take their place; without `features` they are zero.
-        feature_dim: Width of the language codes where there are none.
-    """
-    n, opacity = len(params["means"]), params["opacity_logits"]
-    absent = {"indicator_logits": opacity.clone(), "features": torch.zeros(n, feature_dim)}
-    named = {name: params[name] if name in params else absent[name] for name in PARAMETERS}
-    return named | {name: params[name] for name in LANGUAGE_SHAPE if name in params}
+def _started(row: Attribute, made: Mapping[str, Tensor], params: Parameters) -> Tensor:
+    if isinstance(row.start, str):
+        return (made[row.start] if row.start in made else params[row.start]).clone()
+    return torch.full((len(params["means"]), *(row.shape or ())), row.start)
 
 
-def logit(probability: float) -> float:
-    """Inverse of the logistic function for a value strictly between 0 and 1."""
-    return torch.tensor(probability, dtype=torch.float64).logit().item()
-
-
-class _Logistic(torch.autograd.Function):
-    """1 / (1 + exp(-x)), whose bits do not depend on the number of threads: those of `torch.sigmoid` do (torch 2.13).
-
-    Its slope is not y (1 - y), which is 0 in float32 from x = 17 on and would hold a Gaussian at 1 for ever.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        return x.neg().exp_().add_(1).reciprocal_()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, d_y: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (x,) = ctx.saved_tensors
-        falloff = x.abs().neg_().exp_()  # the slope is even in x
-        return d_y * falloff / (1 + falloff).square_()
-
-
-def _logistic(x: Tensor) -> Tensor:
-    return cast(Tensor, _Logistic.apply(x))
+def _fitted(row: Attribute, value: Tensor) -> Tensor:
+    if row.shape is None or value.shape[1:] == row.shape:
+        return value
+    if row.role == "weight":
+        return at_levels(value, row.shape[0] if row.shape else None)
+    fresh = torch.full((len(value), *row.shape), float(row.start))
+    if len(row.shape) == 2 and value.dim() == 3:  # harmonics
+        shared = min(row.shape[0], value.shape[1])
+        fresh[:, :shared] = value[:, :shared]
+    return fresh

@@ -5,19 +5,26 @@ Three dialects differ in what follows the rotation: ours ``lang_0`` ... and ``in
 """
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32
 from plyfile import PlyData, PlyElement
-from torch import Tensor, nn
+from torch import Tensor
 
 from vlgs.data.untrusted.ply import read_vertices
 from vlgs.files import write_atomically
-from vlgs.gaussians.parameters import complete
+from vlgs.gaussians.attributes import (
+    LANGUAGE_SHAPE,
+    STANDARD,
+    THREE_DGS,
+    Attribute,
+    Attributes,
+)
+from vlgs.gaussians.parameters import Parameters, complete
 from vlgs.gaussians.sound import require_sound
 
 Dialect = Literal["vlgs", "3dgs", "feature3dgs"]
@@ -34,21 +41,23 @@ _NOTES_END = 4096
 
 def write_ply(
     path: str | Path,
-    params: nn.ParameterDict | Mapping[str, Tensor],
+    params: Parameters,
     dialect: Dialect = "vlgs",
     notes: Sequence[str] = (),
+    attributes: Attributes = STANDARD,
 ) -> None:
     """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
 
     Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator`` (one per mask level as ``indicator_0`` ...),
-    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ...; readers that look
-    properties up by name pass over them. The file is complete or the one before stays.
+    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ..., further attributes under
+    their names; readers that look properties up by name pass over them. The file is complete or the one before stays.
 
     Args:
         path: The file; its folder must exist.
-        params: The keys of `vlgs.gaussians.PARAMETERS`.
-        dialect: ``3dgs`` leaves language out, ``feature3dgs`` calls the codes ``semantic_0`` ... and leaves the indicator out.
+        params: Raw parameters.
+        dialect: ``3dgs`` leaves out what 3DGS does not have, ``feature3dgs`` all of that but the codes, which it calls ``semantic_0`` ...
         notes: ASCII lines for the header, `PLAIN` first; without it, nobody knows whether the parameters wait for a fusion.
+        attributes: The table of `params`.
 
     Raises:
         ValueError: If a value is not finite or a quaternion is zero; names the parameter and how many rows.
@@ -56,29 +65,19 @@ def write_ply(
     """
     columns = {name: value.detach().to(torch.float32) for name, value in params.items()}
     require_sound(f"ply {path}", columns)
-    named: list[tuple[str, Tensor]] = []
-    _append(named, ("x", "y", "z"), columns["means"])
-    _append(named, ("nx", "ny", "nz"), torch.zeros_like(columns["means"]))
-    _append(named, _numbered("f_dc", 3), columns["sh0"])
-    rest = columns["shN"].transpose(1, 2).flatten(1)  # all of red, then green, then blue
-    _append(named, _numbered("f_rest", rest.shape[1]), rest)
-    _append(named, ("opacity",), columns["opacity_logits"][:, None])
-    _append(named, _numbered("scale", 3), columns["log_scales"])
-    _append(named, _numbered("rot", 4), columns["quats"])
-    if dialect != "3dgs":
-        stem = "lang" if dialect == "vlgs" else "semantic"
-        _append(named, _numbered(stem, columns["features"].shape[1]), columns["features"])
-    if dialect == "vlgs":
-        logits = columns["indicator_logits"]
-        if logits.dim() == 1:
-            _append(named, ("indicator",), logits[:, None])
-        else:
-            _append(named, _numbered("indicator", logits.shape[1]), logits)
-        if "language_quats" in columns:
-            _append(named, _numbered("language_scale", 3), columns["language_log_scales"])
-            _append(named, _numbered("language_rot", 4), columns["language_quats"])
-    vertices = np.empty(len(columns["means"]), dtype=[(name, "<f4") for name, _ in named])
-    for name, column in named:
+    named: dict[str, Tensor] = {}
+    for name, row in _in_dialect(attributes, dialect).items():
+        if name not in columns:
+            continue
+        value = columns[name]
+        if value.dim() == 3:  # harmonics: all of red, then green, then blue
+            value = value.mT.flatten(1)
+        names = row.column_names(None if value.dim() == 1 else value.shape[1])
+        named |= zip(names, value.reshape(len(value), len(names)).unbind(1), strict=True)
+        if name == "means":  # 3DGS's normals, which nobody reads
+            named |= dict.fromkeys(("nx", "ny", "nz"), torch.zeros(len(value)))
+    vertices = np.empty(len(columns["means"]), dtype=[(name, "<f4") for name in named])
+    for name, column in named.items():
         vertices[name] = column.numpy()
     stream = io.BytesIO()
     element = PlyElement.describe(vertices, "vertex")
@@ -86,8 +85,17 @@ def write_ply(
     write_atomically(Path(path), stream.getvalue())
 
 
+def _in_dialect(attributes: Attributes, dialect: Dialect) -> Attributes:
+    if dialect == "vlgs":
+        return attributes
+    kept = {name: attributes[name] for name in THREE_DGS}
+    if dialect == "feature3dgs":
+        kept["features"] = replace(attributes["features"], columns="semantic")
+    return kept
+
+
 def read_ply(path: str | Path, feature_dim: int = 3) -> dict[str, Tensor]:
-    """Raw parameters of a 3DGS file of any spherical harmonics degree, keyed by `vlgs.gaussians.PARAMETERS`.
+    """Raw parameters of a 3DGS file of any spherical harmonics degree, by the names of `vlgs.gaussians.STANDARD`.
 
     Properties are looked up by name. Without an indicator the opacity's logit takes its place.
 
@@ -115,8 +123,8 @@ def read_notes(path: str | Path) -> tuple[str, ...]:
     return notes if ours else ()
 
 
-def parse_ply(path: str | Path) -> dict[str, Tensor]:
-    """The `vlgs.gaussians.PARAMETERS` of a file, not yet checked; `features` and `indicator_logits` may be missing.
+def parse_ply(path: str | Path, attributes: Attributes = STANDARD) -> dict[str, Tensor]:
+    """What a file holds of a table of attributes, not yet checked; those that 3DGS does not have may be missing.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -124,55 +132,53 @@ def parse_ply(path: str | Path) -> dict[str, Tensor]:
     """
     path = Path(path)
     vertices = read_vertices(path)
-    present = set(vertices)
-    if "packed_position" in present:
+    if "packed_position" in vertices:
         raise ValueError(
             f"ply {path}: must be uncompressed, got the compressed.ply of PlayCanvas and SuperSplat; export it as PLY "
             "there, or: npx @playcanvas/splat-transform IN plain.ply"
         )
     count = len(next(iter(vertices.values()), ()))
-    n_rest = sum(name.startswith("f_rest_") for name in present)
+    n_rest = _numbered(vertices, "f_rest")
     if n_rest not in [3 * count for count in SH_COEFFICIENTS]:
         raise ValueError(f"ply {path}: f_rest properties must be 0, 9, 24 or 45, got {n_rest}")
-    stem = "lang" if "lang_0" in present else "semantic"
-    n_lang = sum(name.startswith(f"{stem}_") for name in present)
-
-    def take(*names: str) -> Float32[Tensor, "n c"]:
+    if "lang_0" not in vertices:
+        attributes = {**attributes, "features": replace(attributes["features"], columns="semantic")}
+    params = {}
+    for name, row in attributes.items():
+        names = _columns_of(row, vertices)
+        if names is None:
+            continue
         columns = np.empty((count, len(names)), np.float32)
-        for index, name in enumerate(names):
-            if name not in present:
+        for index, column in enumerate(names):
+            if column not in vertices:
                 raise ValueError(
-                    f"ply {path}: vertex must have the numeric property {name}, got none"
+                    f"ply {path}: vertex must have the numeric property {column}, got none"
                 )
             # A double beyond float32 becomes inf, which is refused below.
             with np.errstate(over="ignore"):
-                columns[:, index] = vertices[name]
-        return torch.from_numpy(columns)
-
-    params = {
-        "means": take("x", "y", "z"),
-        "quats": take(*_numbered("rot", 4)),
-        "log_scales": take(*_numbered("scale", 3)),
-        "sh0": take(*_numbered("f_dc", 3)),
-        "shN": take(*_numbered("f_rest", n_rest)).unflatten(1, (3, n_rest // 3)).mT.contiguous(),
-        "opacity_logits": take("opacity")[:, 0],
-    }
-    if "indicator" in present:
-        params["indicator_logits"] = take("indicator")[:, 0]
-    elif "indicator_0" in present:
-        n_levels = sum(name.startswith("indicator_") for name in present)
-        params["indicator_logits"] = take(*_numbered("indicator", n_levels))
-    if n_lang:
-        params["features"] = take(*_numbered(stem, n_lang))
-    if "language_rot_0" in present:
-        params["language_quats"] = take(*_numbered("language_rot", 4))
-        params["language_log_scales"] = take(*_numbered("language_scale", 3))
+                columns[:, index] = vertices[column]
+        value = torch.from_numpy(columns)
+        if name == "shN":
+            value = value.unflatten(1, (3, n_rest // 3)).mT.contiguous()
+        params[name] = value[:, 0] if names == (row.columns,) else value
     return params
 
 
-def _numbered(stem: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{stem}_{index}" for index in range(count))
+def _columns_of(row: Attribute, present: Collection[str]) -> tuple[str, ...] | None:
+    """The properties that a file has, or must have, of an attribute; None where it need not and has not."""
+    own_shape = row.name in LANGUAGE_SHAPE and "language_rot_0" in present
+    required = row.name in THREE_DGS or own_shape
+    if isinstance(row.columns, tuple) or row.shape == ():
+        names = row.column_names(None)
+    elif row.shape is None:
+        single = row.columns in present
+        names = row.column_names(None if single else _numbered(present, row.columns))
+    else:
+        names = row.column_names(row.shape[0])
+    there = row.name not in LANGUAGE_SHAPE and bool(names) and names[0] in present
+    return names if required or there else None
 
 
-def _append(named: list[tuple[str, Tensor]], names: tuple[str, ...], values: Tensor) -> None:
-    named.extend(zip(names, values.unbind(1), strict=True))
+def _numbered(present: Collection[str], stem: str) -> int:
+    """How many properties are called ``stem_...``."""
+    return sum(name.startswith(f"{stem}_") for name in present)

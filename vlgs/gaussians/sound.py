@@ -6,12 +6,14 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from vlgs.gaussians.attributes import STANDARD
+
 
 def broken_rows(params: Mapping[str, Tensor]) -> dict[str, Bool[Tensor, " n"]]:
     """What is wrong -> rows; only what occurs. Not finite, or a quaternion without a direction.
 
     Args:
-        params: Any of the keys of `vlgs.gaussians.PARAMETERS`.
+        params: Raw parameters, of any attributes.
     """
     found = {}
     for name, value in params.items():
@@ -19,9 +21,9 @@ def broken_rows(params: Mapping[str, Tensor]) -> dict[str, Bool[Tensor, " n"]]:
         found[f"{name} must be finite"] = (
             broken if value.dim() == 1 else broken.flatten(1).any(dim=1)
         )
-    for name in ("quats", "language_quats"):
-        if name in params:
-            found[f"{name} must not be zero"] = params[name].norm(dim=1) == 0
+    for name, value in params.items():
+        if name in STANDARD and STANDARD[name].role == "rotation":
+            found[f"{name} must not be zero"] = value.norm(dim=1) == 0
     return {what: rows for what, rows in found.items() if rows.any()}
 
 

@@ -29,7 +29,7 @@ _SH_COEFFICIENTS = (0, 3, 8, 15)
 
 
 def parse_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], int]:
-    """What a checkpoint holds of `vlgs.gaussians.PARAMETERS`, not yet judged, and its iteration.
+    """What a checkpoint holds of `vlgs.gaussians.STANDARD`, not yet judged, and its iteration.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -69,7 +69,7 @@ def write_checkpoint(
 
     Args:
         path: The file.
-        params: The keys of `vlgs.gaussians.PARAMETERS`.
+        params: Raw parameters, by the names of `vlgs.gaussians.STANDARD`.
         language: Whether the features go with it, as LangSplat's 13th value; indicators have no place in either.
         iteration: Iterations that the Gaussians are said to have had.
 

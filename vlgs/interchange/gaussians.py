@@ -36,7 +36,7 @@ class Imported:
     """Gaussians from a file."""
 
     params: Mapping[str, Tensor]
-    """All of `vlgs.gaussians.PARAMETERS`, and `LANGUAGE_SHAPE` where the file has it."""
+    """Those of `vlgs.gaussians.STANDARD`; covariances of language's own only where the file has them."""
     has_language: bool
     """Whether the features came from the file."""
     langsplat: bool

@@ -25,7 +25,7 @@ _UNIT = 0.02
 
 
 def parse_splat(path: str | Path) -> dict[str, Tensor]:
-    """What a file holds of `vlgs.gaussians.PARAMETERS`, not yet judged.
+    """What a file holds of `vlgs.gaussians.STANDARD`, not yet judged.
 
     Raises:
         FileNotFoundError: If there is no such file.

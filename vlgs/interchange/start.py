@@ -4,53 +4,46 @@ import hashlib
 import logging
 from pathlib import Path
 
-import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from vlgs.gaussians.config import GaussiansConfig
+from vlgs.gaussians import Attributes, conform
 from vlgs.interchange.gaussians import read_gaussians
 
 log = logging.getLogger(__name__)
 
 
-def start_from(path: str | Path, config: GaussiansConfig, feature_dim: int) -> dict[str, Tensor]:
-    """Raw parameters of a file for a model that stores `config.degree` and codes of `feature_dim`.
+def start_from(path: str | Path, attributes: Attributes) -> dict[str, Tensor]:
+    """Raw parameters of a file for a model with these attributes; see `vlgs.gaussians.conform` for what differs.
 
-    Spherical harmonics are cut or filled with zeros. Language codes of another width start at zero. Those of LangSplat
-    checkpoints come at unit length, as LangSplat renders them.
+    Codes of LangSplat checkpoints come at unit length, as LangSplat renders them.
 
     Args:
         path: See `vlgs.interchange.read_gaussians`.
-        config: What the Gaussians carry.
-        feature_dim: Width d of the codec.
+        attributes: What the Gaussians carry.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If the file cannot be used, or holds no Gaussian.
     """
-    read = read_gaussians(path, feature_dim)
+    shape = attributes["features"].shape
+    assert shape is not None  # a training's table has them all
+    read = read_gaussians(path, shape[0])
     if read.doubt:
         log.warning("%s: %s", path, read.doubt)
     params = dict(read.params)
     n = len(params["means"])
     if n == 0:
         raise ValueError(f"gaussians: init {path} must hold Gaussians, got none")
-    coefficients = (config.degree + 1) ** 2 - 1
-    rest = torch.zeros(n, coefficients, 3)
-    shared = min(coefficients, params["shN"].shape[1])
-    rest[:, :shared] = params["shN"][:, :shared]
-    params["shN"] = rest
     width = params["features"].shape[1]
     if read.langsplat:
         params["features"] = normalize(params["features"], dim=1, eps=1e-9)
-    if width != feature_dim:
+    if width != shape[0]:
         log.warning(
-            "%s: language codes of width %d start at zero (codec: %d)", path, width, feature_dim
+            "%s: language codes of width %d start at zero (codec: %d)", path, width, shape[0]
         )
-        params["features"] = torch.zeros(n, feature_dim)
     log.info("%d Gaussians from %s", n, path)
-    return params
+    return conform(params, attributes)
 
 
 def file_digest(path: str | Path, key: str = "init") -> str:

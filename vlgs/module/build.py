@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from torch import Tensor
 
@@ -12,9 +12,8 @@ from vlgs.codec.autoencoder import Autoencoder
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
-from vlgs.gaussians import GaussiansConfig, Sharing, initialise
+from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
 from vlgs.gaussians.background import with_background
-from vlgs.gaussians.parameters import with_language_shape, with_level_indicators
 from vlgs.indicator import Indicator, PerLevel
 from vlgs.interchange import load_weights, start_from
 from vlgs.losses import Losses
@@ -74,19 +73,28 @@ def build_module(
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
     width = codec.dim * scene.mask_levels
-    if start is not None:
-        parameters = dict(start)
-    elif config.init is None:
-        parameters = with_background(initialise(scene, config, width, seed), scene, config)
-    else:
-        parameters = start_from(config.init, config, width)
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.means and not parts.sharing.covariances
-    parameters = with_language_shape(parameters, own)
     several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
-    parameters = with_level_indicators(parameters, scene.mask_levels if several else None)
-    evaluated = config.color == "evaluated"
-    model = SplatModel(parameters, fusion, parts.indicator, codec, parts.raster, 0, evaluated)
+    levels = scene.mask_levels if several else None
+    attributes = attributes_of(config, width, levels, own, asdict(parts.trainer.learning_rates))
+    if start is not None:
+        parameters = conform(start, attributes)
+    elif config.init is not None:
+        parameters = start_from(config.init, attributes)
+    else:
+        first = initialise(scene, config, attributes, seed)
+        parameters = with_background(first, scene, config.background, attributes)
+    model = SplatModel(
+        parameters,
+        fusion,
+        parts.indicator,
+        codec,
+        parts.raster,
+        sh_degree=0,
+        evaluated=config.color == "evaluated",
+        attributes=attributes,
+    )
     module = VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
     if config.init_features == "lifted":
         lift_features(module)

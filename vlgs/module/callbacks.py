@@ -54,6 +54,7 @@ class Densification(L.Callback):
                 module.seed,
                 done,
                 module.centers,
+                module.model.attributes,
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)

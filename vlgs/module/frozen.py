@@ -8,12 +8,9 @@ from torch import Tensor
 
 from vlgs.fields.frozen import FrozenViews
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
-from vlgs.gaussians.parameters import LANGUAGE_SHAPE
 from vlgs.module.skips import SkipCount
 from vlgs.ops.frozen import FrozenView
 from vlgs.types import Camera, Shape
-
-GEOMETRY = frozenset({"means", "quats", "log_scales", *LANGUAGE_SHAPE})
 
 
 def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None:
@@ -34,6 +31,13 @@ def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None
         )
     for name in names:
         model.splats[name].requires_grad_(False)
+
+
+def has_frozen_shape(model: SplatModel) -> bool:
+    """Whether positions, rotations and scales keep their values."""
+    shape = ("position", "rotation", "scale")
+    rows = (row.name for row in model.attributes.values() if row.role in shape)
+    return not any(model.splats[name].requires_grad for name in rows)
 
 
 class FrozenRenders:

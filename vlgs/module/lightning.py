@@ -18,7 +18,7 @@ from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
 from vlgs.module.blended import BlendPlan, CamerasBetween, plan_blend
 from vlgs.module.exposure import Exposure
-from vlgs.module.frozen import GEOMETRY, FrozenRenders, freeze
+from vlgs.module.frozen import FrozenRenders, freeze, has_frozen_shape
 from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.settings import TrainerConfig
 from vlgs.module.skips import SkipCount
@@ -117,9 +117,8 @@ class VLGSModule(L.LightningModule):
         self.screen_gradients: tuple[Tensor, ...] = ()
         self.skips = SkipCount()
         self.frozen = None
-        geometry = GEOMETRY & set(model.splats)
         keeps = trainer_config.skip.frozen_weights and color and not model.evaluated
-        if keeps and set(trainer_config.freeze) >= geometry:
+        if keeps and has_frozen_shape(model):
             self.frozen = FrozenRenders(model, trainer_config.skip.frozen_budget, self.skips)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -211,7 +210,7 @@ class VLGSModule(L.LightningModule):
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = self.settings.learning_rates
         groups = [
-            {"params": [parameter], "lr": rates.of(name), "name": name}
+            {"params": [parameter], "lr": self.model.attributes[name].rate, "name": name}
             for name, parameter in self.model.splats.items()
             if parameter.requires_grad
         ]
@@ -350,7 +349,8 @@ class VLGSModule(L.LightningModule):
             if parameter.grad is not None:
                 looked_at[f"gradient of {name}"] = parameter.grad
             # Others are looked at where they are read; these come to a finite weight or scale, with no gradient, at infinity.
-            if name.endswith(("_logits", "log_scales")):
+            row = self.model.attributes.get(name.removeprefix("splats."))
+            if row is not None and row.activation != "none":
                 looked_at[name] = parameter.detach()
         # Finite only if every number is; the sum of large ones can overflow, hence the search.
         if all(math.isfinite(tensor.sum().item()) for tensor in looked_at.values()):

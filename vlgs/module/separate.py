@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.none import NoFusion
-from vlgs.gaussians.parameters import PARAMETERS
 from vlgs.indicator import Fixed, Learned, PerLevel
 from vlgs.module.build import Parts
 from vlgs.types import Scene
@@ -65,8 +64,16 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
         # A weight of exactly 1 has an infinite logit, which no file may hold.
         value = torch.full((m,), language.indicator.value)
         theirs["indicator_logits"] = value.logit().clamp(NOWHERE, -NOWHERE)
-    both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in PARAMETERS}
+    both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in ours}
     indicator = language.indicator if isinstance(language.indicator, PerLevel) else Learned()
-    model = SplatModel(both, NoFusion(), indicator, language.codec, color.raster, color.sh_degree)
+    model = SplatModel(
+        both,
+        NoFusion(),
+        indicator,
+        language.codec,
+        color.raster,
+        color.sh_degree,
+        attributes=language.attributes,
+    )
     model.splats = nn.ParameterDict({k: nn.Parameter(v, False) for k, v in both.items()})
     return model

@@ -42,10 +42,6 @@ class LearningRates:
                     f"learning_rates: {name} must be 0 or {SMALLEST_RATE:g} to 1, got {rate}"
                 )
 
-    def of(self, parameter: str) -> float:
-        """Rate of a parameter of the Gaussians; language's own shape is learned like colour's."""
-        return getattr(self, parameter.removeprefix("language_"))
-
 
 @dataclass(frozen=True)
 class SkipConfig:
@@ -83,7 +79,7 @@ class TrainerConfig:
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
     freeze: Sequence[str] = ()
-    """Parameters of the Gaussians that keep their values, names of `vlgs.gaussians.PARAMETERS`."""
+    """Parameters of the Gaussians that keep their values, by name (`vlgs.gaussians.attributes`)."""
     exposure: bool = False
     """Whether every training photograph has a gain, white balance and offset of its own (`vlgs.module.exposure`)."""
     skip: SkipConfig = field(default_factory=SkipConfig)

@@ -14,7 +14,6 @@ from vlgs.types import Camera
 
 log = logging.getLogger(__name__)
 
-WEIGHTS = ("opacity_logits", "indicator_logits")
 ALARM = 0.9
 """Share from which a look counts. Gaussians behind opaque ones have no gradient in any healthy run; nine in ten do not."""
 LOOKS = 3
@@ -57,7 +56,7 @@ class StuckAlarm(L.Callback):
         self.every = every
         self.shares: dict[str, float] = {}
         self.alarmed: set[str] = set()
-        self.in_a_row = dict.fromkeys(WEIGHTS, 0)
+        self.in_a_row: dict[str, int] = {}
 
     def on_train_batch_end(
         self,
@@ -74,12 +73,13 @@ class StuckAlarm(L.Callback):
         means2d = [render.mean2d for render in pl_module.report.renders]
         views = pl_module.sampler.pair(pl_module.next_step - 1)
         cameras = [pl_module.scene.train[index].camera for index in views]
-        for name in WEIGHTS:
+        weights = (r.name for r in pl_module.model.attributes.values() if r.role == "weight")
+        for name in weights:
             gradient = pl_module.model.splats[name].grad
             if gradient is None:  # this weight takes no part, e.g. with indicator=opacity
                 continue
             share = self.shares[name] = stuck_share(gradient, means2d, cameras)
-            self.in_a_row[name] = self.in_a_row[name] + 1 if share >= ALARM else 0
+            self.in_a_row[name] = self.in_a_row.get(name, 0) + 1 if share >= ALARM else 0
             if self.in_a_row[name] >= LOOKS and name not in self.alarmed:
                 self.alarmed.add(name)
                 log.warning(

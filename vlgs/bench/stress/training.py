@@ -16,7 +16,8 @@ from vlgs.bench.stress.case import Case, Verdict
 from vlgs.bench.stress.splats import make_splats
 from vlgs.config import CONF, instantiate
 from vlgs.data.synthetic import load_scene
-from vlgs.gaussians.parameters import activate, logit
+from vlgs.gaussians.logistic import logit
+from vlgs.gaussians.parameters import activate
 from vlgs.module import stuck
 from vlgs.module.build import Parts, build_module
 from vlgs.module.checkpoint import load_checkpoint
