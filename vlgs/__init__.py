@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlgs.render import rasterize as rasterize
+    from vlgs.ops.rasterize import rasterize as rasterize
     from vlgs.types import Camera as Camera
     from vlgs.types import ChannelGroup as ChannelGroup
     from vlgs.types import RasterConfig as RasterConfig
@@ -23,7 +23,7 @@ __version__ = "0.1.0"
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOME = {
-    "rasterize": "vlgs.render",
+    "rasterize": "vlgs.ops.rasterize",
     "Camera": "vlgs.types",
     "ChannelGroup": "vlgs.types",
     "RasterConfig": "vlgs.types",

@@ -155,9 +155,9 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
         options = FitOptions(meta={}, progress=False)
         stages = Stages(RunFolder(Path(scratch)), make_parts, lambda: options, config.seed)
         joint = config.levels == "joint"
-        models = train_all(stages, scenes, instantiate(config.sharing), NoAugment(), joint=joint)
+        field = train_all(stages, scenes, instantiate(config.sharing), NoAugment(), joint=joint)
     query, protocol = instantiate(config.query), instantiate(config.protocol)
-    evaluate(models, replace(scene, test=scene.test[:1]), query, text, protocol)
+    evaluate(field, replace(scene, test=scene.test[:1]), query, text, protocol)
 
 
 def _make_parts(config: DictConfig) -> Any:

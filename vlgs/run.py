@@ -132,11 +132,11 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: Scenes) -> int:
     stages = make_stages(folder, config, scenes)
     try:
         sharing, augment = instantiate(config.sharing), instantiate(config.augment)
-        models = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
+        field = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
     except StoppedError as stop:
         log.warning("%s; the same command goes on from there:\n  %s", stop, _command())
         return STOPPED
-    return _say(_report(folder, config, scenes, models, stages, text), folder)
+    return _say(_report(folder, config, scenes, field, stages, text), folder)
 
 
 def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
@@ -151,14 +151,13 @@ def _report(
     folder: RunFolder,
     config: DictConfig,
     scenes: Scenes,
-    models: list[Any],
+    field: Any,
     stages: Any,
     text: Any,
 ) -> dict[str, Any]:
-    """Evaluate the trained models and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished."""
-    from vlgs.gaussians import write_ply
+    """Evaluate the trained scene and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished."""
+    from vlgs.fields.cloud import write_point_cloud
     from vlgs.module.stages import all_skips
-    from vlgs.render.cloud import point_cloud
     from vlgs.report.evaluate import evaluate
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
@@ -166,27 +165,30 @@ def _report(
     from vlgs.report.timing import measure_fps
     from vlgs.report.words import questions_of
 
-    model, scene = models[-1], next(reversed(scenes.values()))
+    scene = next(reversed(scenes.values()))
     query, protocol = instantiate(config.query), instantiate(config.protocol)
     done, kept = stages.done.values(), stages.kept
     folder.require_own()
-    for stage in kept:
-        cloud = point_cloud(stage.model, [view.camera for view in scene.train], stage.color)
-        write_ply(stage.folder.ply, cloud.params, notes=cloud.notes)
-    evaluation = evaluate(models, scene, query, text, protocol)
-    asked = questions_of(model, scene, query, text)
+    trained_on = [view.camera for view in scene.train]
+    written = [
+        stage.folder.ply
+        for stage in kept
+        if write_point_cloud(stage.folder.ply, stage.field, trained_on)
+    ]
+    evaluation = evaluate(field, scene, query, text, protocol)
+    asked = questions_of(field, scene, query, text)
     prompts = asked.prompts if asked else None
     if asked and asked.note:
         query = asked.query
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
-    if config.levels == "separate" and len(models) > 1:
+    if config.levels == "separate" and len(field.levels()) > 1:
         first, *_, last = scenes
         whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
     cameras, language = [v.camera for v in scene.test or scene.train], len(scene.mask_vectors) > 0
-    timing = measure_fps(model, cameras, query, prompts, language)
+    timing = measure_fps(field, cameras, query, prompts, language)
     if config.pictures:
-        write_pictures(folder.renders, model, scene, query, prompts)
+        write_pictures(folder.renders, field, scene, query, prompts)
     extra = {
         "n_gaussians": sum(stage.model.count for stage in kept),
         "levels": [level for level in scenes if level is not None]
@@ -196,7 +198,7 @@ def _report(
         "train_seconds": sum(stage.seconds for stage in done),
         "skips": all_skips(done).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "ply_bytes": sum(stage.folder.ply.stat().st_size for stage in kept),
+        "ply_bytes": sum(path.stat().st_size for path in written) if written else None,
         "checkpoint_bytes": sum(stage.checkpoint_bytes for stage in kept),
         "seed": config.seed,
         "config_hash": folder.path.name,

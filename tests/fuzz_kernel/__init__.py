@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.fuzz_kernel.layers import run_frozen, run_layers
 from tests.fuzz_kernel.scene import POISON, FuzzScene, make_scene
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import Rendered
 
 NAMED = re.compile(r"^[A-Za-z]\w*: .+ must be .+, got ", re.DOTALL)

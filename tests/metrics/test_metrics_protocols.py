@@ -218,7 +218,7 @@ def test_select3d_counts_what_is_rendered_of_the_selected_alone():
     assert got.per_category == {"left": 0.5, "right": 1}
     assert (got.miou, got.more["acc25"], got.more["acc50"]) == (0.75, 1, 0.5)
     assert figures(Select3d(silhouette=0.95), seen(maps)).miou == 0  # no pixel is opaque enough
-    with pytest.raises(ValueError, match="must hold the Gaussians, got pixels only"):
+    with pytest.raises(ValueError, match="selects Gaussians, and the field has none"):
         Select3d().score(Evidence(**{**vars(seen(maps)), "splats": None}))
 
 

@@ -10,6 +10,8 @@ from tiny_runs import TINY, composed
 from vlgs.codec import Codec
 from vlgs.codec.identity import Identity
 from vlgs.config import instantiate
+from vlgs.fields import HasGaussians
+from vlgs.fields.trained import SplatField
 from vlgs.gaussians import densify, read_ply, write_ply
 from vlgs.gaussians.densify import DensifyState
 from vlgs.gaussians.logistic import logit
@@ -18,7 +20,6 @@ from vlgs.module.build import Parts, bind, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.joint import join_levels
 from vlgs.module.lightning import VLGSModule
-from vlgs.render.level import LevelModel, by_level
 from vlgs.runs import RunFolder
 from vlgs.types import Scene
 
@@ -185,14 +186,24 @@ def test_a_level_is_rendered_and_asked_as_if_it_were_alone(scenes: list[Scene]):
             model.splats["features"].add_(torch.arange(9) * 0.1)  # levels differ
             whole = model.render(camera)
             assert whole.feature is not None
-            for level, asked in enumerate(by_level(model)):
-                alone = asked.render(camera, fused=asked.fuse())
-                assert torch.equal(alone.color, whole.color)  # type: ignore[arg-type]
-                want = whole.feature[..., 3 * level : 3 * level + 3]
-                torch.testing.assert_close(alone.feature, want, rtol=1e-5, atol=1e-6)
-                assert asked.fuse().language_weight.dim() == 1
+        field, words = SplatField(model), model.codec.decode(torch.randn(4, 3))
+        together = field.render(camera, frozenset({"color", "feature"}))
+        for level, alone in enumerate(field.levels()):
+            image = alone.render(camera, frozenset({"color", "alpha", "feature"}))
+            assert torch.equal(image.color, whole.color)  # type: ignore[arg-type]
+            assert torch.equal(image.alpha, whole.alpha_color)  # type: ignore[arg-type]
+            assert torch.equal(image.feature[0], whole.feature[..., 3 * level : 3 * level + 3])  # type: ignore[index]
+            found = field.similarity(camera, words, together)[level]
+            assert torch.equal(alone.similarity(camera, words)[0], found)
+            assert isinstance(alone, HasGaussians)
+            assert alone.language_weights().dim() == 1
+            of_gaussians = field.gaussian_similarity(words)[level]
+            assert torch.equal(alone.gaussian_similarity(words)[0], of_gaussians)
+            some = torch.tensor([3, 700, 41])
+            picked = field.similarity(camera, words, pixels=some)[level, :, 0]
+            torch.testing.assert_close(picked, found.flatten(1)[:, some])
     with pytest.raises(ValueError, match="level must be below 3, got 3"):
-        LevelModel(model, 3)
+        SplatField(model, level=3)
 
 
 @pytest.mark.parametrize("overrides", [(), ("indicator=per_level", "fusion=none")])

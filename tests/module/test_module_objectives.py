@@ -12,6 +12,7 @@ from tiny_runs import TINY, composed
 from torch import Tensor, nn
 
 from vlgs.config import instantiate
+from vlgs.fields.splat import ViewRender
 from vlgs.gaussians import GaussiansConfig, attributes_of, read_ply, write_ply
 from vlgs.gaussians.ply import parse_ply
 from vlgs.identity import run_id
@@ -19,7 +20,6 @@ from vlgs.losses import l1_dssim, masked_cosine, masked_l1, masked_mse
 from vlgs.module.state import capture
 from vlgs.objectives import BlendedView, Language, Objective, Photometric, StepView
 from vlgs.objectives.targets import Target
-from vlgs.render.model import ViewRender
 from vlgs.types import Scene
 
 VALID = torch.tensor([[True, False], [True, True]])

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vlgs.query import LerfRelevancy, Query, VocabSoftmax, cosines, decoded_cosines
+from vlgs.fields.similarity import cosines, decoded_cosines
+from vlgs.query import LerfRelevancy, Query, VocabSoftmax
 
 QUERIES = (LerfRelevancy(), VocabSoftmax(), VocabSoftmax(negatives=("object",)))
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from vlgs.bench.workload import make_workload
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import ChannelGroup, RasterConfig
 
 PUBLISHED = Path(__file__).parents[2] / "../shared/reference/workload.py"

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from render_scenes import Splats, random_splats, render, render_with_gradients
 from torch import Tensor
 
-from vlgs.ops.rasterize import check_camera, check_config, check_tensors
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import check_camera, check_config, check_tensors, rasterize
 from vlgs.types import Camera, ChannelGroup, RasterConfig
 
 

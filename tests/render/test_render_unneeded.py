@@ -8,7 +8,7 @@ import torch
 from render_scenes import Splats, random_splats, render
 from torch import Tensor
 
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import ChannelGroup, RasterConfig, Rendered
 
 CHANNELS = [(3, 3), (3, 16), (3, 100), (5,), (3, 3, 3)]

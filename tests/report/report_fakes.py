@@ -1,18 +1,19 @@
 """A drawn still life with a model that has learnt it almost: everything a report needs, without a rasterizer."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from vlgs.fields import Field, FieldImages, PointCloud
+from vlgs.fields.similarity import cosines
 from vlgs.types import (
     IGNORE_ID,
     Camera,
     DenseLabels,
-    Gaussians,
     ObjectLabels,
     Scene,
     View,
@@ -131,62 +132,19 @@ def scene(views: int = 3, width: int = 200, height: int = 150, **labels: bool) -
     )
 
 
-class Identity:
-    """A codec whose codes are the embeddings."""
+class FakeField:
+    """Shows the drawing with noise of a given strength; 0 is the truth. Its features are embeddings, and it has Gaussians."""
 
-    def decode(self, codes: Tensor) -> Tensor:
-        """Codes themselves."""
-        return codes
-
-
-@dataclass(frozen=True)
-class FakeFused:
-    """The Gaussians and what blends language."""
-
-    gaussians: Gaussians
-    language_weight: Tensor
-
-    @property
-    def feature(self) -> Tensor:
-        """Codes of the Gaussians; nothing is fused."""
-        return self.gaussians.features
-
-
-@dataclass(frozen=True)
-class FakeRender:
-    """A modality that was not asked for is None."""
-
-    color: Tensor | None
-    feature: Tensor | None
-
-
-class FakeModel:
-    """Renders the drawing with noise of a given strength; 0 is the truth."""
-
-    codec = Identity()
+    outputs = frozenset({"color", "feature"})
 
     def __init__(self, noise: float = 0.0) -> None:
         self.noise = noise
 
-    def fuse(self) -> FakeFused:
-        """A thousand Gaussians, most of them more indicative than opaque."""
-        rng = torch.Generator().manual_seed(1)
-        n = 1000
-        o = torch.rand(n, generator=rng)
-        indicator = (o + 0.6 * torch.rand(n, generator=rng) - 0.1).clamp(0, 1)
-        gaussians = Gaussians(
-            torch.zeros(n, 3), torch.ones(n, 4), torch.ones(n, 3), o, indicator,
-            torch.zeros(n, 3), torch.zeros(n, 0, 3), torch.zeros(n, EMBEDDING),
-        )  # fmt: skip
-        return FakeFused(gaussians, indicator)
+    def levels(self) -> Sequence[Field]:
+        """The one level."""
+        return (self,)
 
-    def render(
-        self,
-        camera: Camera,
-        color: bool = True,
-        language: bool = True,
-        fused: FakeFused | None = None,
-    ) -> FakeRender:
+    def render(self, camera: Camera, outputs: frozenset[str]) -> FieldImages:
         """The drawing that the camera sees."""
         drawing = self._drawing(camera)
         rng = torch.Generator().manual_seed(2)
@@ -194,7 +152,41 @@ class FakeModel:
         image = image + self.noise * torch.randn(image.shape, generator=rng)
         feature = vocabulary(CLASSES).vectors[drawing.shown]
         feature = feature + self.noise * torch.randn(feature.shape, generator=rng)
-        return FakeRender(image if color else None, feature if language else None)
+        return FieldImages(
+            color=image if "color" in outputs else None,
+            feature=feature[None] if "feature" in outputs else None,
+        )
+
+    def similarity(
+        self,
+        camera: Camera,
+        words: Float[Tensor, "k e"],
+        seen: FieldImages | None = None,
+        pixels: Int[Tensor, " p"] | None = None,
+    ) -> Float[Tensor, "levels k h w"]:
+        """Cosines with the features."""
+        feature = (seen or self.render(camera, frozenset({"feature"}))).feature
+        assert feature is not None
+        if pixels is not None:
+            feature = feature.flatten(1, 2)[:, None, pixels]
+        return torch.stack([cosines(level, words) for level in feature])
+
+    def opacities(self) -> Tensor:
+        """Of a thousand Gaussians."""
+        return torch.rand(1000, generator=torch.Generator().manual_seed(1))
+
+    def language_weights(self) -> Tensor:
+        """Most of them more indicative than opaque."""
+        more = torch.rand(1000, generator=torch.Generator().manual_seed(3))
+        return (self.opacities() + 0.6 * more - 0.1).clamp(0, 1)
+
+    def codes(self) -> Tensor:
+        """Embeddings of the Gaussians."""
+        return torch.zeros(1000, EMBEDDING)
+
+    def gaussian_similarity(self, words: Tensor) -> Tensor:
+        """Cosines with the codes."""
+        return cosines(self.codes(), words)[None]
 
     def render_values(
         self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
@@ -205,6 +197,10 @@ class FakeModel:
         image = per_class[drawing.shown]
         image[: drawing.height // 8, : drawing.width // 6] = -0.6
         return torch.stack([image, torch.ones_like(image)], dim=-1)[..., : values.shape[1]]
+
+    def point_cloud(self, cameras: Sequence[Camera]) -> PointCloud:
+        """Not asked for."""
+        raise NotImplementedError
 
     @staticmethod
     def _drawing(camera: Camera) -> Drawing:

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from report_fakes import CLASSES, Drawing, FakeFused, FakeModel, scene, view, vocabulary, with_test
+from report_fakes import CLASSES, Drawing, FakeField, scene, view, vocabulary, with_test
 
+from vlgs.fields.several import SeveralFields
 from vlgs.metrics.dense import Dense
 from vlgs.metrics.goi import Goi
 from vlgs.metrics.lerf_ovs import LerfOvs
@@ -16,7 +17,7 @@ from vlgs.query import LerfRelevancy, VocabSoftmax
 from vlgs.query.text import VocabularyText
 from vlgs.report.evaluate import Evaluation, evaluate, prompts_of
 from vlgs.report.language import LanguageTally
-from vlgs.types import IGNORE_ID, Camera, DenseLabels, Gaussians, ObjectLabels, Scene
+from vlgs.types import IGNORE_ID, Camera, DenseLabels, ObjectLabels, Scene
 
 AUTO = Auto()
 OBJECTS = CLASSES[2:5]
@@ -26,7 +27,7 @@ def score(
     scene: Scene, noise: float = 0.0, protocol: EvaluationProtocol | Auto = AUTO
 ) -> Evaluation:
     return evaluate(
-        FakeModel(noise), scene, LerfRelevancy(), VocabularyText(scene.vocabulary), protocol
+        FakeField(noise), scene, LerfRelevancy(), VocabularyText(scene.vocabulary), protocol
     )
 
 
@@ -117,7 +118,7 @@ def test_missing_words_cost_only_the_language_scores(
     text: VocabularyText | None, classes: tuple[str, ...], reason: str
 ):
     where = replace(scene(1), classes=classes)
-    got = evaluate(FakeModel(), where, LerfRelevancy(), text, AUTO)
+    got = evaluate(FakeField(), where, LerfRelevancy(), text, AUTO)
     assert (got.miou, got.loc_acc, dict(got.per_category)) == (None, None, {})
     assert reason in got.reasons["miou"]
     assert got.ssim == pytest.approx(1)
@@ -125,7 +126,7 @@ def test_missing_words_cost_only_the_language_scores(
 
 
 def test_vocab_softmax_needs_no_negatives():
-    got = evaluate(FakeModel(), scene(1), VocabSoftmax(), VocabularyText(vocabulary(CLASSES)), AUTO)
+    got = evaluate(FakeField(), scene(1), VocabSoftmax(), VocabularyText(vocabulary(CLASSES)), AUTO)
     assert (got.miou, got.loc_acc) == (1, 1)
 
 
@@ -204,15 +205,17 @@ def test_every_protocol_can_be_the_headline(protocol: EvaluationProtocol, name: 
     assert ("loc_acc" in got.reasons) == (got.loc_acc is None)
 
 
-class TwoGaussians(FakeModel):
+class TwoGaussians(FakeField):
     """The kettle as one Gaussian and the apple as another; a silhouette is what has weight."""
 
-    def fuse(self) -> FakeFused:
-        fused = super().fuse()
-        codes = vocabulary(CLASSES).vectors[[3, 4]]
-        two = {k: v[:2] for k, v in vars(fused.gaussians).items() if isinstance(v, torch.Tensor)}
-        two["features"] = codes
-        return FakeFused(Gaussians(**two), torch.tensor([0.9, 0.8]))  # pyright: ignore[reportArgumentType]
+    def opacities(self) -> torch.Tensor:
+        return super().opacities()[:2]
+
+    def language_weights(self) -> torch.Tensor:
+        return torch.tensor([0.9, 0.8])
+
+    def codes(self) -> torch.Tensor:
+        return vocabulary(CLASSES).vectors[[3, 4]]
 
     def render_values(self, camera: Camera, values: torch.Tensor, weight: torch.Tensor):
         ids = self._drawing(camera).ids
@@ -236,20 +239,20 @@ def test_selection_in_3d_renders_the_selected_gaussians_alone():
     assert faint.per_category["red apple"] == 0  # its weight is 0.8
 
 
-def test_three_levels_are_three_models():
+def test_three_levels_are_three_fields():
     where = scene(objects=True)
     text = VocabularyText(where.vocabulary)
-    models = [FakeModel(5.0), FakeModel(5.0), FakeModel()]
-    got = evaluate(models, where, LerfRelevancy(), text, LerfOvs())
-    alone = evaluate(models[:1], where, LerfRelevancy(), text, LerfOvs())
+    fields = [FakeField(5.0), FakeField(5.0), FakeField()]
+    got = evaluate(SeveralFields(fields), where, LerfRelevancy(), text, LerfOvs())
+    alone = evaluate(fields[0], where, LerfRelevancy(), text, LerfOvs())
     assert alone.psnr == got.psnr  # colour is that of the first
     assert alone.loc_acc is not None
     assert got.loc_acc is not None
     assert got.loc_acc >= alone.loc_acc
     rows = [row for row in got.queries if row["protocol"] == "lerf_ovs@1/synthetic"]
     assert {row["level"] for row in rows} <= {0, 1, 2}
-    with pytest.raises(ValueError, match="at least one model, got none"):
-        evaluate([], where, LerfRelevancy(), text, LerfOvs())
+    with pytest.raises(ValueError, match="at least one field, got none"):
+        SeveralFields([])
 
 
 def test_every_query_is_kept():

@@ -1,40 +1,31 @@
 """The histogram of l - o counts pixels under the kind of their true class."""
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import pytest
 import torch
+from report_fakes import FakeField
 from torch import Tensor
 
-from vlgs.report.answer import RenderedView
 from vlgs.report.indicator import ANY, Histogram
-from vlgs.types import IGNORE_ID, Camera, DenseLabels, Gaussians, View
+from vlgs.types import IGNORE_ID, Camera, DenseLabels, View
 
 
-@dataclass
-class Flat:
-    """A model whose pixel i is Gaussian i alone."""
+class Flat(FakeField):
+    """A field whose pixel i is Gaussian i alone."""
 
-    codec: Any = None
+    def __init__(self, language: list[float], opacity: list[float]) -> None:
+        super().__init__()
+        self.language, self.opacity = torch.tensor(language), torch.tensor(opacity)
 
-    def fuse(self) -> Any:
-        raise NotImplementedError
+    def language_weights(self) -> Tensor:
+        return self.language
 
-    def render(
-        self, camera: Camera, color: bool = True, language: bool = True, fused: Any = None
-    ) -> RenderedView:
-        raise NotImplementedError
+    def opacities(self) -> Tensor:
+        return self.opacity
 
     def render_values(self, camera: Camera, values: Tensor, weight: Tensor) -> Tensor:
         return (values * weight[:, None]).reshape(camera.height, camera.width, -1)
-
-
-@dataclass
-class Shared:
-    gaussians: Gaussians
-    feature: Tensor
-    language_weight: Tensor
 
 
 def view_of(ids: Tensor) -> View:
@@ -48,26 +39,11 @@ def view_of(ids: Tensor) -> View:
     )
 
 
-def shared_of(language: list[float], opacity: list[float]) -> Shared:
-    n = len(language)
-    gaussians = Gaussians(
-        means=torch.zeros(n, 3),
-        quats=torch.zeros(n, 4),
-        scales=torch.ones(n, 3),
-        opacities=torch.tensor(opacity),
-        indicators=torch.tensor(language),
-        sh0=torch.zeros(n, 3),
-        shN=torch.zeros(n, 15, 3),
-        features=torch.zeros(n, 3),
-    )
-    return Shared(gaussians, gaussians.features, gaussians.indicators)
-
-
 def test_pixels_count_under_the_kind_of_their_class():
     histogram = Histogram(["glass", "wall"], {"glass": "translucent_reflective", "wall": "other"})
     ids = torch.tensor([[0, 0, 1], [1, IGNORE_ID, 1]], dtype=torch.uint8)
-    fused = shared_of([0.9, 0.83, 0.52, 0.53, 0.9, 0.3], [0.18, 0.1, 0.5, 0.5, 0.1, 0.78])
-    histogram.add(view_of(ids), Flat(), fused)
+    field = Flat([0.9, 0.83, 0.52, 0.53, 0.9, 0.3], [0.18, 0.1, 0.5, 0.5, 0.1, 0.78])
+    histogram.add(view_of(ids), field)
     shares = histogram.shares()
     assert shares is not None
     edges = torch.tensor(shares["edges"])
@@ -85,8 +61,8 @@ def test_without_labels_or_kinds():
     histogram = Histogram(["a"], {})
     ids = torch.zeros(1, 2, dtype=torch.uint8)
     unlabelled = replace(view_of(ids), read_dense_labels=None)
-    fused = shared_of([0.5, 0.5], [0.5, 0.5])
-    histogram.add(unlabelled, Flat(), fused)
+    field = Flat([0.5, 0.5], [0.5, 0.5])
+    histogram.add(unlabelled, field)
     assert histogram.shares() is None
-    histogram.add(view_of(ids), Flat(), fused)
+    histogram.add(view_of(ids), field)
     assert set(histogram.shares() or {}) == {"edges", ANY}

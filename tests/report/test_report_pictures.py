@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from report_fakes import CLASSES, NEGATIVES, Drawing, FakeModel, scene, view, vocabulary, with_test
+from report_fakes import CLASSES, NEGATIVES, Drawing, FakeField, scene, view, vocabulary, with_test
 
 from vlgs.query import LerfRelevancy, Prompts
 from vlgs.query.text import VocabularyText
@@ -124,7 +124,7 @@ def test_hostile_names_have_pictures_of_their_own(tmp_path: Path):
             replace(view, name=name) for view, name in zip(still_life.test, names, strict=True)
         ),
     )
-    write_pictures(tmp_path, FakeModel(), hostile, QUERY, prompts(hostile))
+    write_pictures(tmp_path, FakeField(), hostile, QUERY, prompts(hostile))
     folders = sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
     assert len(folders) == 3
     drawn = {path.name for path in tmp_path.glob("*/relevancy_*.png")}
@@ -135,7 +135,7 @@ def test_hostile_names_have_pictures_of_their_own(tmp_path: Path):
 def test_every_picture_of_a_view_is_written(tmp_path: Path):
     still_life = scene(2)
     overview = write_pictures(
-        tmp_path / "renders", FakeModel(0.05), still_life, QUERY, prompts(still_life),
+        tmp_path / "renders", FakeField(0.05), still_life, QUERY, prompts(still_life),
         PictureLimits(views=2, prompts=2, rows=1),
     )  # fmt: skip
     assert overview == tmp_path / "renders" / "overview.png"
@@ -153,7 +153,7 @@ def test_every_picture_of_a_view_is_written(tmp_path: Path):
 
 
 def test_scene_without_words_still_has_colour_features_and_indicator(tmp_path: Path):
-    write_pictures(tmp_path, FakeModel(), scene(1), QUERY, None)
+    write_pictures(tmp_path, FakeField(), scene(1), QUERY, None)
     assert {p.stem for p in (tmp_path / "view_00").iterdir()} == {
         "photograph", "render", "features", "indicator_minus_opacity",
     }  # fmt: skip
@@ -164,21 +164,21 @@ def test_views_with_and_without_labels_share_a_sheet(tmp_path: Path):
     some = scene(2)
     bare = replace(some.test[1], read_dense_labels=None)
     assert write_pictures(
-        tmp_path, FakeModel(), with_test(some, some.test[0], bare), QUERY, prompts(some)
+        tmp_path, FakeField(), with_test(some, some.test[0], bare), QUERY, prompts(some)
     )
     assert not (tmp_path / "view_01" / "labels.png").exists()
 
 
 def test_no_view_no_picture(tmp_path: Path):
     assert (
-        write_pictures(tmp_path / "renders", FakeModel(), with_test(scene()), QUERY, None) is None
+        write_pictures(tmp_path / "renders", FakeField(), with_test(scene()), QUERY, None) is None
     )
     assert not (tmp_path / "renders").exists()
 
 
 def test_overview_shows_a_new_prompt_in_each_row_and_glass_first():
     still_life = scene(4)
-    painter = Painter(FakeModel(), still_life, QUERY, prompts(still_life), still_life.test)
+    painter = Painter(FakeField(), still_life, QUERY, prompts(still_life), still_life.test)
     first = [next(iter(painter.draw(v, 6).prompts)) for v in still_life.test]
     assert set(first[:2]) == {"wine glass", "steel kettle"}
     assert first[2] == "red apple"
@@ -186,7 +186,7 @@ def test_overview_shows_a_new_prompt_in_each_row_and_glass_first():
 
 def test_pictures_show_the_object_that_was_asked_for():
     still_life = scene(1)
-    painter = Painter(FakeModel(), still_life, QUERY, prompts(still_life), still_life.test)
+    painter = Painter(FakeField(), still_life, QUERY, prompts(still_life), still_life.test)
     pictures = painter.draw(still_life.test[0], 6)
     glass = pictures.prompts["wine glass"]
     red, blue = glass.relevancy[75, 50].int(), glass.relevancy[75, 110].int()  # glass and kettle
@@ -203,7 +203,7 @@ def test_pictures_show_the_object_that_was_asked_for():
 def test_object_labels_alone_give_prompts_but_no_class_map():
     some = scene(1)
     labelled = with_test(some, view(Drawing(), "objects", dense=False, objects=True))
-    painter = Painter(FakeModel(), labelled, QUERY, prompts(labelled), labelled.test)
+    painter = Painter(FakeField(), labelled, QUERY, prompts(labelled), labelled.test)
     pictures = painter.draw(labelled.test[0], 6)
     assert set(pictures.prompts) == {"wine glass", "steel kettle", "red apple"}
     assert pictures.labels is None
@@ -211,6 +211,6 @@ def test_object_labels_alone_give_prompts_but_no_class_map():
 
 def test_without_language_only_colour_is_drawn(tmp_path: Path):
     silent = replace(scene(), mask_vectors=torch.zeros(0, 8), mask_areas=torch.zeros(0))
-    write_pictures(tmp_path, FakeModel(), silent, QUERY, None)
+    write_pictures(tmp_path, FakeField(), silent, QUERY, None)
     names = {path.name for path in tmp_path.rglob("*.png")}
     assert names == {"overview.png", "photograph.png", "render.png"}

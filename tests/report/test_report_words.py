@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from report_fakes import CLASSES, EMBEDDING, NEGATIVES, FakeModel, scene, vocabulary
+from report_fakes import CLASSES, EMBEDDING, NEGATIVES, FakeField, scene, vocabulary
 from tiny_runs import TINY, composed
 
 from vlgs.data.export import write_scene
@@ -50,7 +50,7 @@ def test_the_vocabulary_is_asked_without_what_words_are_compared_with():
 def test_of_many_words_those_that_answer_best_are_asked_and_the_rest_is_counted():
     where = replace(unlabelled(), vocabulary=many(1200))
     text = VocabularyText(where.vocabulary)
-    asked = questions_of(FakeModel(0.02), where, QUERY, text, PictureLimits(words=5))
+    asked = questions_of(FakeField(0.02), where, QUERY, text, PictureLimits(words=5))
     assert asked is not None
     assert set(asked.prompts.names) == SHOWN
     assert (
@@ -62,7 +62,7 @@ def test_of_many_words_those_that_answer_best_are_asked_and_the_rest_is_counted(
 
 def test_a_short_vocabulary_is_asked_in_its_own_order():
     where = unlabelled()
-    asked = questions_of(FakeModel(), where, QUERY, VocabularyText(where.vocabulary))
+    asked = questions_of(FakeField(), where, QUERY, VocabularyText(where.vocabulary))
     assert asked is not None
     assert asked.prompts.names == CLASSES
     assert asked.note == f"the pictures ask for {', '.join(CLASSES)}"
@@ -85,9 +85,9 @@ def test_without_negatives_words_compete_with_each_other_and_the_note_says_so():
 
 def test_each_word_has_a_heat_map_that_is_cold_where_the_word_is_not(tmp_path: Path):
     where = unlabelled()
-    asked = questions_of(FakeModel(), where, QUERY, VocabularyText(where.vocabulary))
+    asked = questions_of(FakeField(), where, QUERY, VocabularyText(where.vocabulary))
     assert asked is not None
-    write_pictures(tmp_path, FakeModel(), where, asked.query, asked.prompts)
+    write_pictures(tmp_path, FakeField(), where, asked.query, asked.prompts)
     drawn = {path.stem for path in (tmp_path / "view_00").iterdir()}
     assert {f"relevancy_{name.replace(' ', '_')}" for name in CLASSES} <= drawn
     assert "prediction" in drawn

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import ChannelGroup, RasterConfig, Rendered
 
 SMOOTH = RasterConfig(alpha_min=1e-12, transmittance_min=0.0)

@@ -22,6 +22,8 @@ from vlgs.blend import FixedBlend, blend_targets
 from vlgs.blend.pose import slerp
 from vlgs.codec.autoencoder import Autoencoder
 from vlgs.codec.identity import Identity
+from vlgs.fields.similarity import cosines, decoded_cosines
+from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
 from vlgs.fusion.mlp import MLP
@@ -44,15 +46,13 @@ from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
 from vlgs.ops.frozen import FrozenView
+from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
 from vlgs.ops.view_color import view_color
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
-from vlgs.query.similarity import cosines, decoded_cosines
-from vlgs.render import rasterize
-from vlgs.render.model import SplatModel
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
-AREAS = ("ops", "render", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+AREAS = ("ops", "fields", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {
@@ -78,15 +78,21 @@ NO_GRADIENT = {
     "vlgs.gaussians.ply.parse_ply": "from a file",
     "vlgs.gaussians.sound.broken_rows": "a mask",
     "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
-    "vlgs.render.model.ViewRender.detach": "takes the gradient away",
-    "vlgs.render.level.LevelModel.fuse": "for questions: a level of what SplatModel.fuse gives",
-    "vlgs.render.level.LevelModel.render": "SplatModel.render",
-    "vlgs.render.level.LevelModel.render_values": "SplatModel.render_values",
+    **{f"vlgs.fields.{name}": "protocol" for name in (
+        "Field.similarity", "HasGaussians.opacities", "HasGaussians.language_weights",
+        "HasGaussians.gaussian_similarity", "HasGaussians.render_values",
+    )},
+    "vlgs.fields.gaussians_of": "returns its argument",
+    **{f"vlgs.fields.trained.SplatField.{name}": "training is over" for name in (
+        "similarity", "opacities", "language_weights", "gaussian_similarity", "render_values",
+    )},
+    "vlgs.fields.several.SeveralFields.similarity": "training is over",
+    "vlgs.fields.splat.ViewRender.detach": "takes the gradient away",
     "vlgs.ops.blend.weights_alone": "the constants of a FrozenView",
     "vlgs.ops.frozen.Weights.render": "protocol",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
-}
+}  # fmt: skip
 
 Check = tuple[Callable[..., object], list[Tensor]]
 
@@ -230,15 +236,15 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.ops.project.project": lambda: rasterizing("cpu", True),
     "vlgs.ops.rasterize_reference.rasterize": lambda: rasterizing("reference", False),
     "vlgs.ops.frozen.FrozenView.render": frozen,
-    "vlgs.render.model.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
-    "vlgs.render.model.SplatModel.gaussians": lambda: model(
+    "vlgs.fields.splat.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
+    "vlgs.fields.splat.SplatModel.gaussians": lambda: model(
         lambda m: tensors(m.gaussians())
     ),
-    "vlgs.render.model.SplatModel.fuse": lambda: model(lambda m: (m.fuse().color, m.fuse().feature)),
-    "vlgs.render.model.SplatModel.render": lambda: model(
+    "vlgs.fields.splat.SplatModel.fuse": lambda: model(lambda m: (m.fuse().color, m.fuse().feature)),
+    "vlgs.fields.splat.SplatModel.render": lambda: model(
         lambda m: (m.render(view()).color, m.render(view()).feature)
     ),
-    "vlgs.render.model.SplatModel.render_values": lambda: model(
+    "vlgs.fields.splat.SplatModel.render_values": lambda: model(
         lambda m: m.render_values(view(), m.splats["features"], m.gaussians().indicators)
     ),
     "vlgs.ops.attention.attend": lambda: (
@@ -296,8 +302,8 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.codec.autoencoder.Autoencoder.decode": lambda: (codec().decode, [draw(3, 3)]),
     "vlgs.codec.identity.Identity.encode": lambda: (Identity(3).encode, [draw(4, 3)]),
     "vlgs.codec.identity.Identity.decode": lambda: (Identity(3).decode, [draw(4, 3)]),
-    "vlgs.query.similarity.cosines": lambda: (cosines, [draw(4, 3), draw(2, 3, seed=1)]),
-    "vlgs.query.similarity.decoded_cosines": lambda: (
+    "vlgs.fields.similarity.cosines": lambda: (cosines, [draw(4, 3), draw(2, 3, seed=1)]),
+    "vlgs.fields.similarity.decoded_cosines": lambda: (
         lambda c, t: decoded_cosines(Identity(3).decode, c, t, chunk=4), [draw(3, 2, 3), draw(2, 3, seed=1)]
     ),
     "vlgs.query.relevancy.LerfRelevancy.relevancy": lambda: (

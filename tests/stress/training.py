@@ -23,7 +23,7 @@ from vlgs.module.build import Parts, build_module
 from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.runs import RunFolder
 from vlgs.types import ChannelGroup, Scene
 

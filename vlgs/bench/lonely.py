@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields.splat import SplatModel
 from vlgs.ops.rasterize import rasterize
-from vlgs.render.model import SplatModel
 from vlgs.types import Camera, ChannelGroup, Scene
 
 SEEN = 0.1

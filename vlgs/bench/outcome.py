@@ -11,7 +11,7 @@ from torch import Tensor
 from vlgs.bench.clock import Pass, time_pass
 from vlgs.bench.scenes import LEAVES
 from vlgs.bench.workload import Workload
-from vlgs.render import rasterize
+from vlgs.ops.rasterize import rasterize
 from vlgs.types import RasterConfig
 
 SMALLEST_ALPHA = 1e-15

@@ -7,6 +7,7 @@ import torch
 
 from vlgs.bench.presets import Trained
 from vlgs.config import instantiate
+from vlgs.fields.trained import SplatField
 from vlgs.report.evaluate import Evaluation, evaluate
 from vlgs.types import RasterConfig
 
@@ -31,7 +32,7 @@ def score(trained: Trained) -> Evaluation:
         text = instantiate(config.text)(vocabulary=scene.vocabulary)
     with torch.no_grad():
         return evaluate(
-            trained.module.model,
+            SplatField(trained.module.model),
             scene,
             instantiate(config.query),
             text,

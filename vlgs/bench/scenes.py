@@ -11,7 +11,7 @@ from vlgs.bench.workload import Workload
 from vlgs.types import Camera, ChannelGroup
 
 if TYPE_CHECKING:
-    from vlgs.render.model import SplatModel
+    from vlgs.fields.splat import SplatModel
 
 LEAVES = ("means", "quats", "scales", "colors", "codes", "opacities", "indicators")
 """Names of what `Workload.leaves` gives, in its order."""

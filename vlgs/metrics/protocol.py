@@ -36,7 +36,7 @@ class Evidence:
     relevancy: Sequence[Float[Tensor, "k h w"]]
     """Of every class under the query."""
     splats: Callable[[], Splats] | None = None
-    """Computed when a protocol asks for it."""
+    """Computed when a protocol asks for it; None where the scene is no Gaussians."""
 
     def levels(self, maps: Sequence[Float[Tensor, "k h w"]], unit: Unit) -> Float[Tensor, "l h w"]:
         """The maps of one unit's category at all levels.
@@ -65,6 +65,10 @@ class Figures:
     reasons: Mapping[str, str] = field(default_factory=dict)
 
 
+class NotScorableError(ValueError):
+    """A protocol needs what the trained scene does not have: its figures are not available, for this reason."""
+
+
 @runtime_checkable
 class EvaluationProtocol(Protocol):
     """The interface of a protocol. Implementations are frozen dataclasses whose fields are the protocol's numbers."""
@@ -80,7 +84,11 @@ class EvaluationProtocol(Protocol):
         ...
 
     def score(self, seen: Evidence) -> list[QueryScore]:
-        """Score one view; a view without the labels that the protocol needs adds nothing."""
+        """Score one view; a view without the labels that the protocol needs adds nothing.
+
+        Raises:
+            NotScorableError: If the protocol needs what the trained scene does not have.
+        """
         ...
 
     def conclude(self, scores: Sequence[QueryScore], classes: Sequence[str]) -> Figures:

@@ -15,7 +15,12 @@ from torch import Tensor
 
 from vlgs.metrics.masks import QueryScore, compare
 from vlgs.metrics.mean import mean_of_known
-from vlgs.metrics.protocol import Evidence, Figures, without_localisation
+from vlgs.metrics.protocol import (
+    Evidence,
+    Figures,
+    NotScorableError,
+    without_localisation,
+)
 from vlgs.metrics.segment import check_relevancy
 
 VERSION = 1
@@ -62,12 +67,13 @@ class Select3d:
         """Score every labelled object of a view.
 
         Raises:
-            ValueError: If the evidence has no Gaussians, sizes differ or the relevancy is not finite.
+            NotScorableError: If the evidence has no Gaussians.
+            ValueError: If sizes differ or the relevancy is not finite.
         """
         if not seen.units:
             return []
         if seen.splats is None:
-            raise ValueError("select3d: the evidence must hold the Gaussians, got pixels only")
+            raise NotScorableError("select3d selects Gaussians, and the field has none")
         splats, scores = seen.splats(), []
         several = len(splats.relevancy) > 1
         for unit in seen.units:

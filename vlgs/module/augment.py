@@ -14,8 +14,8 @@ from torch import Tensor
 from vlgs.blend import UniformBlend, blend_camera
 from vlgs.data.sampler import nearest_views
 from vlgs.data.untrusted.arrays import Archive
+from vlgs.fields.splat import SplatModel
 from vlgs.files import write_atomically
-from vlgs.render.model import SplatModel
 from vlgs.types import Camera, Scene, View
 from vlgs.values import require_range
 

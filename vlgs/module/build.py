@@ -11,6 +11,7 @@ from vlgs.blend import ViewBlend
 from vlgs.codec import Codec
 from vlgs.codec.autoencoder import Autoencoder
 from vlgs.data.sampler import PairSampler, nearest_views
+from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
@@ -22,7 +23,6 @@ from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import SkipConfig, TrainerConfig
 from vlgs.objectives import Objective, Setup
 from vlgs.objectives.targets import TrainingViews
-from vlgs.render.model import SplatModel
 from vlgs.skip_count import SkipCount
 from vlgs.types import RasterConfig, Scene
 

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields.frozen import FrozenViews
+from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.ops.frozen import FrozenView
-from vlgs.render.frozen import FrozenViews
-from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 from vlgs.skip_count import SkipCount
 from vlgs.types import Camera, Shape
 

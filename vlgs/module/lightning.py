@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.module.exposure import Exposure
@@ -15,7 +16,6 @@ from vlgs.module.frozen import FrozenRenders, freeze, has_frozen_shape
 from vlgs.module.settings import TrainerConfig
 from vlgs.module.step import StepReport, TrainingStep
 from vlgs.objectives import Setup
-from vlgs.render.model import SplatModel
 
 HARMONICS = {0: 0, 3: 1, 8: 2, 15: 3}
 """Coefficients above degree 0 -> degree."""

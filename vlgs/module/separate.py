@@ -5,10 +5,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from vlgs.fields.splat import SplatModel
 from vlgs.fusion.none import NoFusion
 from vlgs.indicator import Fixed, Learned, PerLevel
 from vlgs.module.build import Parts
-from vlgs.render.model import SplatModel
 from vlgs.types import Scene
 
 NOWHERE = -100.0

@@ -11,6 +11,10 @@ from dataclasses import dataclass, field
 
 import torch
 
+from vlgs.fields import Field
+from vlgs.fields.several import SeveralFields
+from vlgs.fields.splat import SplatModel
+from vlgs.fields.trained import SplatField
 from vlgs.gaussians import Sharing
 from vlgs.module.augment import NoAugment, Offline
 from vlgs.module.build import Parts, build_module
@@ -21,8 +25,6 @@ from vlgs.module.lift import lift_features
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.separate import for_language, unite, without_language
 from vlgs.module.state import capture
-from vlgs.render.level import LevelModel, by_level
-from vlgs.render.model import SplatModel
 from vlgs.runs import RunFolder
 from vlgs.skip_count import SkipCount
 from vlgs.types import Scene
@@ -54,6 +56,11 @@ class Stage:
     checkpoint_bytes: int
     color: bool = True
     """Off: trained for language alone."""
+
+    @property
+    def field(self) -> Field:
+        """What was trained."""
+        return SplatField(self.model, self.color)
 
 
 @dataclass
@@ -137,7 +144,7 @@ def train_all(
     sharing: Sharing,
     augment: Offline | NoAugment,
     joint: bool = False,
-) -> list[SplatModel | LevelModel]:
+) -> Field:
     """Train everything that a run is made of.
 
     Args:
@@ -149,7 +156,7 @@ def train_all(
         joint: Whether one model learns all levels.
 
     Returns:
-        One model per level, in their order; one alone if there is no language.
+        The trained scene, of all mask levels in their order.
 
     Raises:
         StoppedError: If training was asked to stop.
@@ -178,7 +185,8 @@ def train_all(
         else:
             language = stages.train("/".join(filter(None, [name, "language"])), scene, color=False)
             models.append(unite(color, language))
-    return [at_level for model in models for at_level in by_level(model)]
+    fields = [SplatField(model) for model in models]
+    return fields[0] if len(fields) == 1 else SeveralFields(fields)
 
 
 def all_skips(stages: Iterable[Stage]) -> SkipCount:

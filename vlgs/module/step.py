@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.losses import masked_mse
 from vlgs.module.exposure import Exposure
 from vlgs.module.frozen import FrozenRenders
 from vlgs.objectives import Setup, StepView
 from vlgs.objectives.objective import all_needs
 from vlgs.objectives.targets import Target
-from vlgs.render.model import FusedGaussians, SplatModel, ViewRender
 
 COLOR = frozenset({"color"})
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.blend import ViewBlend
+from vlgs.fields.splat import ViewRender
 from vlgs.objectives.targets import Target, TrainingViews
-from vlgs.render.model import ViewRender
 from vlgs.skip_count import SkipCount
 
 

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from vlgs.query.prompts import Prompts, encode_prompts
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
-from vlgs.query.similarity import cosines, decoded_cosines
 from vlgs.query.text import TextEncoder
 from vlgs.query.words import Questions, encode_questions, words_of
 
@@ -19,8 +18,6 @@ __all__ = [
     "Questions",
     "TextEncoder",
     "VocabSoftmax",
-    "cosines",
-    "decoded_cosines",
     "encode_prompts",
     "encode_questions",
     "words_of",
@@ -32,7 +29,7 @@ class Query(Protocol):
     """The interface of a query: turns the cosines between a pixel and words into the relevancy of each prompt.
 
     A query is a function of cosines alone, so that decoding and the one large matrix product are shared by all queries and by
-    the class map of the same view (`vlgs.query.similarity`).
+    the class map of the same view (`vlgs.fields.similarity`).
     """
 
     @property

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.query.similarity import cosines
+from vlgs.fields.similarity import cosines
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 """LERF's words for anything at all (Kerr et al., ICCV 2023)."""

@@ -7,13 +7,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vlgs.fields import Field, HasGaussians
 from vlgs.metrics.dense import predict_classes
 from vlgs.metrics.masks import Unit
 from vlgs.metrics.segment import blend, segment, smooth
 from vlgs.query import Prompts, Query
 from vlgs.report import colors
-from vlgs.report.answer import Answer, Fused, ViewModel, answer_view
-from vlgs.report.features import fit_feature_colors, paint_features
+from vlgs.report.answer import Answer, answer_view
+from vlgs.report.features import FeatureColors, fit_feature_colors, paint_features
 from vlgs.report.indicator import indicator_difference
 from vlgs.report.labels import read_truth, read_units
 from vlgs.types import IGNORE_ID, Scene, View
@@ -37,9 +38,9 @@ class ViewPictures:
     photograph: UInt8[Tensor, "h w 3"]
     render: UInt8[Tensor, "h w 3"]
     features: UInt8[Tensor, "h w 3"] | None = None
-    """Like `difference`, None where no language was trained."""
+    """None where no language was trained, or the field renders no features."""
     difference: UInt8[Tensor, "h w 3"] | None = None
-    """l - o as seen from the view (Fig. 3)."""
+    """l - o as seen from the view (Fig. 3); None where no language was trained, or the field has no Gaussians."""
     labels: UInt8[Tensor, "h w 3"] | None = None
     """True classes, where the view has one for every pixel."""
     prediction: UInt8[Tensor, "h w 3"] | None = None
@@ -56,7 +57,7 @@ class Painter:
     """Draws views of one trained scene; feature colours mean the same in all of them.
 
     Args:
-        model: The trained scene.
+        field: The trained scene; of several mask levels the last, of whole objects, is drawn.
         scene: Its held-out views and labels.
         query: How relevancy is computed.
         prompts: The scene's classes, encoded, or words for a scene without any; without either there is nothing to answer.
@@ -66,38 +67,34 @@ class Painter:
     @torch.no_grad()
     def __init__(
         self,
-        model: ViewModel,
+        field: Field,
         scene: Scene,
         query: Query,
         prompts: Prompts | None,
         views: Sequence[View],
     ) -> None:
-        self.model, self.scene, self.query, self.prompts = model, scene, query, prompts
-        self.fused: Fused = model.fuse()
+        self.field, self.scene, self.query, self.prompts = field.levels()[-1], scene, query, prompts
+        self.gaussians = self.field if isinstance(self.field, HasGaussians) else None
         self.has_language = len(scene.mask_vectors) > 0
-        self.feature_colors = fit_feature_colors(
-            answer_view(model, view.camera, None, self.fused).feature for view in views
-        )
+        self.feature_colors = self._feature_colors(views)
         self.times_asked = dict.fromkeys(scene.classes, 0)
         self.ranges = None if scene.classes or prompts is None else self._ranges(views)
 
     @torch.no_grad()
     def draw(self, view: View, max_prompts: int) -> ViewPictures:
         """All pictures of one view; prompts that other views have shown less often come first."""
-        answer = answer_view(self.model, view.camera, self.prompts, self.fused)
+        answer = answer_view(self.field, view.camera, self.prompts)
         pictures = ViewPictures(
             name=view.name,
             photograph=view.read_image(),
             render=colors.to_uint8(answer.color),
         )
-        if self.has_language:
-            pictures = replace(
-                pictures,
-                features=paint_features(answer.feature, self.feature_colors),
-                difference=colors.diverging(
-                    indicator_difference(self.model, self.fused, view.camera)
-                ),
-            )
+        if self.feature_colors is not None and answer.feature is not None:
+            shown = paint_features(answer.feature[0], self.feature_colors)
+            pictures = replace(pictures, features=shown)
+        if self.has_language and self.gaussians is not None:
+            difference = indicator_difference(self.gaussians, view.camera)
+            pictures = replace(pictures, difference=colors.diverging(difference))
         if self.prompts is None:
             return pictures
         if self.ranges is not None:
@@ -107,6 +104,14 @@ class Painter:
         prompts = self._answer_prompts(answer, pictures.photograph, units)
         pictures = replace(pictures, prompts=prompts)
         return pictures if truth is None else self._add_classes(pictures, answer, truth)
+
+    def _feature_colors(self, views: Sequence[View]) -> FeatureColors | None:
+        """None where there are no features to show."""
+        feature = frozenset({"feature"})
+        if not self.has_language or not feature <= self.field.outputs:
+            return None
+        seen = (self.field.render(view.camera, feature).feature for view in views)
+        return fit_feature_colors(image[0] for image in seen if image is not None)
 
     def _choose(self, units: Sequence[Unit], count: int) -> list[Unit]:
         """Prompts that tell most: rarely asked before, then of neither tiny nor view-filling objects, then glass and mirrors."""
@@ -139,7 +144,7 @@ class Painter:
         """Relevancy of some prompts as LERF-OVS segments it."""
         assert answer.cosines is not None  # there are prompts
         assert answer.negatives is not None
-        relevancy = self.query.relevancy(answer.cosines, answer.negatives)[list(rows)]
+        relevancy = self.query.relevancy(answer.cosines[0], answer.negatives[0])[list(rows)]
         return blend(relevancy, smooth(relevancy))
 
     def _ranges(self, views: Sequence[View]) -> Float[Tensor, "2 k"]:
@@ -147,7 +152,7 @@ class Painter:
         assert self.prompts is not None
         rows, bounds = range(len(self.prompts.names)), []
         for view in views:
-            answer = answer_view(self.model, view.camera, self.prompts, self.fused)
+            answer = answer_view(self.field, view.camera, self.prompts)
             bounds.append(torch.stack(self._blended(answer, rows).flatten(1).aminmax(dim=1)))
         low, high = torch.stack(bounds).unbind(dim=1)  # [views, k] each
         return torch.stack([low.amin(dim=0), high.amax(dim=0)])
@@ -165,7 +170,7 @@ class Painter:
             word: colors.heat_over(pictures.photograph, share)
             for word, share in zip(names, shares, strict=True)
         }
-        best = predict_classes([answer.cosines])
+        best = predict_classes(answer.cosines.unbind())
         return replace(
             pictures,
             words=words,
@@ -179,7 +184,7 @@ class Painter:
         assert self.prompts is not None
         assert answer.cosines is not None  # there are prompts
         count = len(self.prompts.names)
-        prediction = predict_classes([answer.cosines])
+        prediction = predict_classes(answer.cosines.unbind())
         shown = {*truth.unique().tolist(), *prediction.unique().tolist()} - {IGNORE_ID}
         return replace(
             pictures,

@@ -6,12 +6,13 @@ from functools import partial
 
 import torch
 
+from vlgs.fields import NO_GAUSSIANS, Field, gaussians_of
 from vlgs.metrics import image
 from vlgs.metrics.masks import QueryScore
 from vlgs.metrics.mean import mean_of_known
 from vlgs.metrics.protocol import Auto, EvaluationProtocol, tag
 from vlgs.query import Prompts, Query, TextEncoder, encode_prompts
-from vlgs.report.answer import Answer, ViewModel, answer_view
+from vlgs.report.answer import Answer, answer_view
 from vlgs.report.indicator import Histogram
 from vlgs.report.language import DENSE, LERF_OVS, LanguageScores, LanguageTally
 from vlgs.report.splats import SplatAnswers
@@ -45,14 +46,14 @@ class Evaluation:
     category_kinds: Mapping[str, str] = field(default_factory=dict)
     """Kind of each category, where the scene says it: ``translucent_reflective`` or ``other``."""
     indicator: Mapping[str, Sequence[float]] | None = None
-    """`vlgs.report.indicator.Histogram` of l - o; None where no held-out view has a class for every pixel."""
+    """`vlgs.report.indicator.Histogram` of l - o; None where no held-out view has a class for every pixel, or there are no Gaussians."""
     queries: Sequence[Mapping[str, str | int | float | bool | None]] = ()
     """Rows of `query_rows`."""
 
 
 @torch.no_grad()
 def evaluate(
-    model: ViewModel | Sequence[ViewModel],
+    field: Field,
     scene: Scene,
     query: Query,
     text: TextEncoder | None,
@@ -65,41 +66,40 @@ def evaluate(
     carries the text vector of its true class.
 
     Args:
-        model: The trained scene, or one per mask level, finest first (``levels=separate``, ``joint``); colour is then that of the first.
+        field: The trained scene.
         scene: Its held-out views, labels and classes.
         query: Relevancy of a prompt.
         text: Encodes `Scene.classes`. Without it, or if it lacks a word, there are no language scores, and the reason is given.
         protocol: Which scores are the headline; the dense ones and those of LERF-OVS stand beside them.
 
     Raises:
-        ValueError: If there is no model, or labels name what `Scene.classes` does not have or differ in size from the view.
+        ValueError: If labels name what `Scene.classes` does not have or differ in size from the view.
     """
-    models = model if isinstance(model, Sequence) else (model,)
-    if not models:
-        raise ValueError("evaluate: there must be at least one model, got none")
     headline = _resolve(protocol, scene)
     prompts, reason = prompts_of(scene, query, text)
-    fused, per_view = [level.fuse() for level in models], {}
+    gaussians, per_view = gaussians_of(field), {}
     tally = splats = None
     histogram = Histogram(scene.classes, scene.class_kinds)
     if prompts is not None:
         tally = LanguageTally(query, prompts, headline)
-        splats = SplatAnswers(models, fused, query, prompts)
+        if gaussians is not None:
+            splats = SplatAnswers(gaussians, query, prompts)
     for view in scene.test:
-        answers = [
-            answer_view(level, view.camera, prompts, shared)
-            for level, shared in zip(models, fused, strict=True)
-        ]
-        per_view[view.name] = _image_scores(view, answers[0])
-        histogram.add(view, models[0], fused[0])
-        if tally is not None and splats is not None:
-            tally.add(view, answers, partial(splats.seen_by, view.camera))
+        answer = answer_view(field, view.camera, prompts)
+        per_view[view.name] = _image_scores(view, answer)
+        if gaussians is not None:
+            histogram.add(view, gaussians[0])
+        if tally is not None:
+            tally.add(view, answer, partial(splats.seen_by, view.camera) if splats else None)
     if tally is not None:
         language = tally.conclude(scene.class_kinds)
     else:
         language = LanguageScores(None, None, {}, {}, {"miou": reason, "loc_acc": reason}, {})
     asked = not isinstance(protocol, Auto) or (prompts is not None and _is_labelled(scene))
     evaluation = _conclude(scene, tag(headline, scene.split), per_view, language, asked)
+    if gaussians is None:
+        reasons = {**evaluation.reasons, "indicator": NO_GAUSSIANS}
+        return replace(evaluation, reasons=reasons)
     return replace(evaluation, indicator=histogram.shares())
 
 

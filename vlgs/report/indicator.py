@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.report.answer import Fused, ViewModel
+from vlgs.fields import HasGaussians
 from vlgs.report.labels import read_truth
 from vlgs.types import Camera, View
 
@@ -15,14 +15,14 @@ ANY = "any"
 """Kind of the categories of a scene that names no kinds."""
 
 
-def indicator_difference(model: ViewModel, fused: Fused, camera: Camera) -> Float[Tensor, "h w"]:
+def indicator_difference(gaussians: HasGaussians, camera: Camera) -> Float[Tensor, "h w"]:
     """Mean of l - o over the Gaussians of each pixel, in [-1, 1]; 0 where there are none.
 
     Gaussians count by the larger of l and o, so that neither glass (low o) nor glare (low l) is hidden.
     """
-    language, color = fused.language_weight, fused.gaussians.opacities
+    language, color = gaussians.language_weights(), gaussians.opacities()
     values = torch.stack([language - color, torch.ones_like(color)], dim=1)
-    image = model.render_values(camera, values, torch.maximum(language, color))
+    image = gaussians.render_values(camera, values, torch.maximum(language, color))
     return image[..., 0] / image[..., 1].clamp_min(1e-3)
 
 
@@ -41,12 +41,12 @@ class Histogram:
         self.kinds = [kinds.get(name, ANY) for name in classes]
         self.counts: dict[str, Tensor] = {}
 
-    def add(self, view: View, model: ViewModel, fused: Fused) -> None:
+    def add(self, view: View, gaussians: HasGaussians) -> None:
         """Count the pixels of one view."""
         truth = read_truth(view)
         if truth is None:
             return
-        difference = indicator_difference(model, fused, view.camera).double()
+        difference = indicator_difference(gaussians, view.camera).double()
         for kind in dict.fromkeys(self.kinds):
             ids = truth.new_tensor([i for i, k in enumerate(self.kinds) if k == kind])
             counts = torch.histc(difference[torch.isin(truth, ids)], bins=BINS, min=-1, max=1)

@@ -7,12 +7,19 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vlgs.fields.similarity import cosines
 from vlgs.metrics.dense import Dense
 from vlgs.metrics.lerf_ovs import LerfOvs
 from vlgs.metrics.masks import QueryScore
 from vlgs.metrics.mean import mean_of_known
-from vlgs.metrics.protocol import EvaluationProtocol, Evidence, Figures, Splats
-from vlgs.query import Prompts, Query, cosines
+from vlgs.metrics.protocol import (
+    EvaluationProtocol,
+    Evidence,
+    Figures,
+    NotScorableError,
+    Splats,
+)
+from vlgs.query import Prompts, Query
 from vlgs.report.answer import Answer
 from vlgs.report.labels import read_truth, read_units
 from vlgs.types import IGNORE_ID, View
@@ -52,20 +59,22 @@ class LanguageTally:
         self.scores: dict[EvaluationProtocol, list[QueryScore]] = {
             protocol: [] for protocol in (headline, DENSE, LERF_OVS)
         }
+        self.reasons: dict[EvaluationProtocol, str] = {}
+        """Why a protocol cannot score this scene at all."""
         self.ceilings: dict[EvaluationProtocol, list[QueryScore]] = {DENSE: [], LERF_OVS: []}
 
     def add(
         self,
         view: View,
-        answers: Sequence[Answer],
+        answer: Answer,
         splats: Callable[[], Splats] | None = None,
     ) -> None:
         """Score one view against its labels; a view without labels adds nothing.
 
         Args:
             view: Whose labels count.
-            answers: Of every mask level.
-            splats: The Gaussians, for protocols that select in 3D.
+            answer: With the prompts.
+            splats: The Gaussians, for protocols that select in 3D; None where there are none.
 
         Raises:
             ValueError: If labels name unknown classes or differ in size from the view.
@@ -74,15 +83,16 @@ class LanguageTally:
         units = read_units(view, self.prompts.names, truth)
         if truth is None and not units:
             return
-        asked, relevancy = [], []
-        for answer in answers:
-            assert answer.cosines is not None  # there are prompts
-            assert answer.negatives is not None
-            asked.append(answer.cosines)
-            relevancy.append(self.query.relevancy(answer.cosines, answer.negatives))
+        assert answer.cosines is not None  # there are prompts
+        assert answer.negatives is not None
+        asked = answer.cosines.unbind()
+        relevancy = list(map(self.query.relevancy, asked, answer.negatives.unbind()))
         seen = Evidence(view.name, self.prompts.names, units, truth, asked, relevancy, splats)
         for protocol, scores in self.scores.items():
-            scores += protocol.score(seen)
+            try:
+                scores += protocol.score(seen)
+            except NotScorableError as error:
+                self.reasons[protocol] = str(error)
         if truth is not None:
             exact = [self._exact_relevancy(truth)]
             best = replace(seen, cosines=exact, relevancy=exact)
@@ -130,6 +140,9 @@ class LanguageTally:
         protocol: EvaluationProtocol,
         scores: Mapping[EvaluationProtocol, Sequence[QueryScore]],
     ) -> Figures:
+        if protocol in self.reasons:
+            why = self.reasons[protocol]
+            return Figures(None, None, {}, reasons={"miou": why, "loc_acc": why})
         return protocol.conclude(scores[protocol], self.prompts.names)
 
     def _exact_relevancy(self, truth: UInt8[Tensor, "h w"]) -> Float[Tensor, "k h w"]:

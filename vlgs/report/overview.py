@@ -65,7 +65,10 @@ def write_histogram(path: Path, density: Float[Tensor, " bins"]) -> None:
 
 
 def write_overview(
-    path: Path, names: Sequence[str], rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
+    path: Path,
+    names: Sequence[str],
+    rows: Sequence[ViewPictures],
+    density: Float[Tensor, " bins"] | None,
 ) -> None:
     """Draw the sheet.
 
@@ -73,7 +76,7 @@ def write_overview(
         path: Ends in .png, .pdf or another format of matplotlib's.
         names: Of the classes, or of the words that are asked instead.
         rows: At least one view. A column that no row has is left out.
-        density: Of l - o, see `count_difference`.
+        density: Of l - o, see `count_difference`; None where there is none to draw.
     """
     from matplotlib import rc_context
 
@@ -99,8 +102,10 @@ def _tiles(row: ViewPictures) -> dict[str, _Tile]:
         PHOTOGRAPH: _Tile(row.photograph),
         RENDER: _Tile(row.render),
     }
-    if row.features is not None and row.difference is not None:
-        tiles |= {FEATURES: _Tile(row.features), DIFFERENCE: _Tile(row.difference)}
+    if row.features is not None:
+        tiles[FEATURES] = _Tile(row.features)
+    if row.difference is not None:
+        tiles[DIFFERENCE] = _Tile(row.difference)
     if row.labels is not None and row.prediction is not None:
         tiles |= {LABELS: _Tile(row.labels), PREDICTION: _Tile(row.prediction)}
     elif row.prediction is not None:
@@ -122,7 +127,10 @@ class _Sheet:
     """Places axes in inches from the top left, because pictures must keep their shape whatever stands around them."""
 
     def __init__(
-        self, names: Sequence[str], rows: Sequence[ViewPictures], density: Float[Tensor, " bins"]
+        self,
+        names: Sequence[str],
+        rows: Sequence[ViewPictures],
+        density: Float[Tensor, " bins"] | None,
     ) -> None:
         from matplotlib.figure import Figure
 
@@ -132,7 +140,8 @@ class _Sheet:
         columns = [c for c in known if any(c in row for row in tiles)]
         heights = [TILE * row.photograph.shape[0] / row.photograph.shape[1] for row in rows]
         self.width = 2 * MARGIN + len(columns) * (TILE + GAP)
-        foot = FOOT if DIFFERENCE in columns else 0
+        has_foot = not set(columns) <= {PHOTOGRAPH, RENDER}
+        foot = FOOT if has_foot else 0
         self.height = 2 * MARGIN + sum(heights) + GAP * len(rows) + foot
         self.figure = Figure(figsize=(self.width, self.height))
         y = MARGIN
@@ -145,15 +154,16 @@ class _Sheet:
                     self._text(self._left(j) + TILE / 2, y - 0.12, column, size=9)
             self._text(MARGIN - 0.13, y + heights[i] / 2, rows[i].name, size=7, rotation=90)
             y += heights[i] + GAP
-        if DIFFERENCE not in columns:
+        if not has_foot:
             return
         shown = sorted({i for row in rows for i in row.classes})
         scales = [c for c in (RELEVANCY, *words[-1:]) if c in columns]
         for column in scales:
             self._heat_scale(self._left(columns.index(column)), y + 0.1)
-        self._legend(names, shown, y + 0.1, columns=len(columns) - 3)
-        last = self._left(columns.index(DIFFERENCE))
-        _draw_histogram(self._axes(last, y + 0.1, TILE, FOOT - 0.35), density)
+        self._legend(names, shown, y + 0.1, columns=max(1, len(columns) - 3))
+        if DIFFERENCE in columns and density is not None:
+            last = self._left(columns.index(DIFFERENCE))
+            _draw_histogram(self._axes(last, y + 0.1, TILE, FOOT - 0.35), density)
 
     def _left(self, column: int) -> float:
         return MARGIN + column * (TILE + GAP)

@@ -9,10 +9,10 @@ from typing import TypeVar
 from jaxtyping import UInt8
 from torch import Tensor
 
+from vlgs.fields import Field
 from vlgs.files import write_atomically
 from vlgs.names import file_names
 from vlgs.query import Prompts, Query
-from vlgs.report.answer import ViewModel
 from vlgs.report.draw import Painter, ViewPictures
 from vlgs.report.overview import count_difference, write_histogram, write_overview
 from vlgs.types import Scene
@@ -36,7 +36,7 @@ class PictureLimits:
 
 def write_pictures(
     folder: Path,
-    model: ViewModel,
+    field: Field,
     scene: Scene,
     query: Query,
     prompts: Prompts | None,
@@ -46,11 +46,11 @@ def write_pictures(
 
     Args:
         folder: Made if needed; the run's ``renders``.
-        model: The trained scene.
+        field: The trained scene; of several mask levels the last, of whole objects, is drawn.
         scene: Its held-out views and labels.
         query: How relevancy is computed.
         prompts: The scene's classes, encoded, or words for a scene without any; without either only colour, features and
-            l - o are drawn, and colour alone where no language was trained.
+            l - o are drawn, and colour alone where no language was trained. l - o needs Gaussians.
         limits: How many views and prompts.
 
     Returns:
@@ -60,7 +60,7 @@ def write_pictures(
     if not views:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    painter = Painter(model, scene, query, prompts, views)
+    painter = Painter(field, scene, query, prompts, views)
     # Of all views and prompts, so that a view and a prompt have one name however few are drawn.
     folders = file_names(view.name for view in scene.test)
     names = file_names(prompts.names if prompts is not None else ())
@@ -72,8 +72,10 @@ def write_pictures(
         write_view(folder / folders[view.name], pictures, names)
         if view.name in on_overview:
             rows.append(pictures)
-    density = count_difference(painter.fused.language_weight, painter.fused.gaussians.opacities)
-    if painter.has_language:
+    density = None
+    if painter.has_language and painter.gaussians is not None:
+        gaussians = painter.gaussians
+        density = count_difference(gaussians.language_weights(), gaussians.opacities())
         write_histogram(folder / "indicator_minus_opacity.png", density)
     path = folder / "overview.png"
     write_overview(path, prompts.names if prompts else (), rows, density)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import torch
 
+from vlgs.fields import Field
 from vlgs.query import Prompts, Query
-from vlgs.report.answer import ViewModel, answer_view
+from vlgs.report.answer import answer_view
 from vlgs.types import Camera
 
 
@@ -27,7 +28,7 @@ class Timing:
 
 @torch.no_grad()
 def measure_fps(
-    model: ViewModel,
+    field: Field,
     cameras: Sequence[Camera],
     query: Query,
     prompts: Prompts | None,
@@ -37,11 +38,11 @@ def measure_fps(
 ) -> Timing:
     """Time renders and queries; warm-up is left out, and cameras take turns.
 
-    Gaussians are fused once beforehand, as a viewer of a finished scene does. A query that judges prompts against each other is
-    timed with all of them, one that does not with the first.
+    Of several mask levels the last, of whole objects, is timed. A query that judges prompts against each other is timed with all
+    of them, one that does not with the first.
 
     Args:
-        model: The trained scene.
+        field: The trained scene.
         cameras: Usually those of the held-out views.
         query: How relevancy is computed.
         prompts: The scene's classes; without them queries are not timed.
@@ -51,24 +52,24 @@ def measure_fps(
     """
     if not cameras:
         return Timing(None, None, None)
-    fused, budget = model.fuse(), seconds / 3
+    whole, budget = field.levels()[-1], seconds / 3
 
     def fps(work: Callable[[Camera], object]) -> float:
         return 1 / _median_seconds(work, itertools.cycle(cameras), budget, repeats)
 
     def ask(camera: Camera, prompts: Prompts) -> None:
-        answer = answer_view(model, camera, prompts, fused)
+        answer = answer_view(whole, camera, prompts)
         assert answer.cosines is not None  # there are prompts
         assert answer.negatives is not None
-        query.relevancy(answer.cosines, answer.negatives)
+        query.relevancy(answer.cosines[0], answer.negatives[0])
 
     fps_language = fps_query = None
-    if language:
-        fps_language = fps(lambda camera: model.render(camera, color=False, fused=fused))
+    if language and "feature" in whole.outputs:
+        fps_language = fps(lambda camera: whole.render(camera, frozenset({"feature"})))
     if prompts is not None:
         one = prompts if query.needs_all_prompts else _first(prompts)
         fps_query = fps(lambda camera: ask(camera, one))
-    fps_color = fps(lambda camera: model.render(camera, language=False, fused=fused))
+    fps_color = fps(lambda camera: whole.render(camera, frozenset({"color"})))
     return Timing(fps_color, fps_language, fps_query)
 
 

@@ -7,15 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields import Field
 from vlgs.query import (
     Prompts,
     Query,
     Questions,
     TextEncoder,
-    decoded_cosines,
     encode_questions,
 )
-from vlgs.report.answer import ViewModel
 from vlgs.report.evaluate import prompts_of
 from vlgs.report.pictures import PictureLimits, spread
 from vlgs.types import Scene
@@ -28,7 +27,7 @@ _VALUES = 1 << 24
 
 
 def questions_of(
-    model: ViewModel,
+    field: Field,
     scene: Scene,
     query: Query,
     text: TextEncoder | None,
@@ -37,7 +36,7 @@ def questions_of(
     """What the pictures of a trained scene ask: its classes; without labels, the words of its vocabulary that answer best.
 
     Args:
-        model: The trained scene.
+        field: The trained scene.
         scene: Its views, classes and vocabulary.
         query: How relevancy is computed.
         text: Encodes words; None where nothing can be asked.
@@ -53,7 +52,7 @@ def questions_of(
     if len(names) <= limits.words:
         note = f"the pictures ask for {', '.join(names)}"
     else:
-        order = rank_words(model, scene, questions, limits.views)[: limits.words]
+        order = rank_words(field, scene, questions, limits.views)[: limits.words]
         questions = replace(questions, prompts=_take(questions.prompts, order))
         note = (
             f"the pictures ask for {', '.join(questions.prompts.names)}: the {len(order)} of {len(names):,} words of the "
@@ -63,8 +62,8 @@ def questions_of(
 
 
 @torch.no_grad()
-def rank_words(model: ViewModel, scene: Scene, questions: Questions, views: int) -> list[int]:
-    """Rows of the prompts, best answer first.
+def rank_words(field: Field, scene: Scene, questions: Questions, views: int) -> list[int]:
+    """Rows of the prompts, best answer first; of several mask levels the last, of whole objects, is asked.
 
     A word answers as well as it is relevant on the pixels where no other word has a larger cosine. One that wins next to no pixel
     comes after those that do.
@@ -73,14 +72,11 @@ def rank_words(model: ViewModel, scene: Scene, questions: Questions, views: int)
     words = torch.cat([prompts.text, prompts.negatives])
     asked = spread(scene.test or scene.train, views)
     pixels = max(1, _VALUES // (len(words) * max(1, len(asked))))
-    fused = model.fuse()
-    samples = []
+    samples, whole = [], field.levels()[-1]
     for view in asked:
-        feature = model.render(view.camera, color=False, language=True, fused=fused).feature
-        assert feature is not None  # language was asked for
-        flat = feature.flatten(0, 1)
-        codes = flat[:: -(-len(flat) // pixels)]
-        samples.append(decoded_cosines(model.codec.decode, codes[None], words)[:, 0])
+        count = view.camera.width * view.camera.height
+        some = torch.arange(0, count, -(-count // pixels))
+        samples.append(whole.similarity(view.camera, words, pixels=some)[0, :, 0])
     cosines = torch.cat(samples, dim=1)  # [k + m, pixels]
     cosines = cosines[:, (cosines != 0).any(dim=0)]  # without language there is no answer
     own, negatives = cosines.split([len(prompts.text), len(prompts.negatives)])

@@ -5,6 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from vlgs.codec.identity import Identity
+from vlgs.fields.cloud import HIGHEST_LOGIT, point_cloud
+from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.fusion.attention import CrossAttention
 from vlgs.fusion.mlp import MLP
@@ -12,8 +14,6 @@ from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import view_color
 from vlgs.geometry import camera_center
 from vlgs.indicator import ColourOpacity, Fixed, Indicator, Learned
-from vlgs.render.cloud import HIGHEST_LOGIT, point_cloud
-from vlgs.render.model import SplatModel
 from vlgs.types import Camera, RasterConfig
 
 N = 30

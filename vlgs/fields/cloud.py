@@ -1,20 +1,21 @@
 """Converts a model to plain Gaussians, from which another program draws the same pictures without fusion or indicator."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import log
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields import Field, HasGaussians, PointCloud
+from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.gaussians.parameters import at_levels
-from vlgs.gaussians.ply import PLAIN, SH_COEFFICIENTS
+from vlgs.gaussians.ply import PLAIN, SH_COEFFICIENTS, write_ply
 from vlgs.gaussians.sh import SH_C0, sh_to_rgb
 from vlgs.geometry import camera_center
 from vlgs.ops.view_color import view_color
-from vlgs.render.model import SplatModel
 from vlgs.types import Camera
 
 HIGHEST_LOGIT = log(2.0**24 - 1)
@@ -25,14 +26,19 @@ RIDGE = 1e-3
 """Regularisation of the fitted harmonics: those that no view determines keep their value."""
 
 
-@dataclass(frozen=True)
-class PointCloud:
-    """Gaussians that are drawn as they are: colour with the opacity, codes with the indicator."""
+def write_point_cloud(path: Path, field: Field, cameras: Sequence[Camera]) -> bool:
+    """Write ``point_cloud.ply``, if the field has Gaussians; whether it has.
 
-    params: dict[str, Tensor]
-    """Those of the model, by name."""
-    notes: tuple[str, ...]
-    """What a file of them says of itself; the first is `vlgs.gaussians.ply.PLAIN`."""
+    Args:
+        path: Where to.
+        field: Of one model.
+        cameras: Where colours count, at least one; the training cameras.
+    """
+    if not isinstance(field, HasGaussians):
+        return False
+    cloud = field.point_cloud(cameras)
+    write_ply(path, cloud.params, notes=cloud.notes)
+    return True
 
 
 @torch.no_grad()

@@ -1,0 +1,131 @@
+"""A trained `SplatModel` as a field."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from vlgs.fields import Field, FieldImages, PointCloud, require_outputs
+from vlgs.fields.cloud import point_cloud
+from vlgs.fields.similarity import decoded_cosines
+from vlgs.fields.splat import FusedGaussians, SplatModel
+from vlgs.types import Camera
+
+
+class SplatField:
+    """Gaussians whose training is over: they are fused once, for all that is asked of them.
+
+    Args:
+        model: The trained scene.
+        color: Off: it was trained for language alone, and renders no colour.
+        level: Place of the one mask level that is asked, from 0; None: all that the model has.
+
+    Raises:
+        ValueError: If the model has no such level.
+    """
+
+    def __init__(self, model: SplatModel, color: bool = True, level: int | None = None) -> None:
+        if level is not None and not 0 <= level < model.levels:
+            raise ValueError(f"splat field: level must be below {model.levels}, got {level}")
+        self.model = model
+        self.color = color
+        self.level = level
+
+    @property
+    def outputs(self) -> frozenset[str]:
+        """See `Field`."""
+        return frozenset({"color", "alpha", "feature"} if self.color else {"feature"})
+
+    def levels(self) -> Sequence[Field]:
+        """See `Field`; all have the same Gaussians and colour."""
+        return (self,) if self.level is not None or self.model.levels == 1 else self._each
+
+    @torch.no_grad()
+    def render(self, camera: Camera, outputs: frozenset[str]) -> FieldImages:
+        """See `Field`: one pass over the tiles."""
+        require_outputs("splat field", outputs, self.outputs)
+        color, language = bool(outputs & {"color", "alpha"}), "feature" in outputs
+        view = self.model.render(camera, color, language, self._fused)
+        return FieldImages(
+            color=view.color if "color" in outputs else None,
+            alpha=view.alpha_color if "alpha" in outputs else None,
+            feature=None if view.feature is None else self._by_level(view.feature),
+        )
+
+    @torch.no_grad()
+    def similarity(
+        self,
+        camera: Camera,
+        words: Float[Tensor, "k e"],
+        seen: FieldImages | None = None,
+        pixels: Int[Tensor, " p"] | None = None,
+    ) -> Float[Tensor, "levels k h w"]:
+        """See `Field`: cosines with the decoded codes."""
+        if seen is None or seen.feature is None:
+            seen = self.render(camera, frozenset({"feature"}))
+        assert seen.feature is not None  # it was asked for
+        codes = seen.feature
+        if pixels is not None:
+            codes = codes.flatten(1, 2)[:, None, pixels]
+        return self._compare(codes, words)
+
+    def opacities(self) -> Float[Tensor, " n"]:
+        """See `HasGaussians`."""
+        return self._fused.gaussians.opacities
+
+    def language_weights(self) -> Float[Tensor, " n *levels"]:
+        """See `HasGaussians`; one for all levels, or one each with ``indicator=per_level``."""
+        return self._fused.language_weight
+
+    @torch.no_grad()
+    def gaussian_similarity(self, words: Float[Tensor, "k e"]) -> Float[Tensor, "levels k n"]:
+        """See `HasGaussians`."""
+        return self._compare(self._by_level(self._fused.feature[None]), words)[:, :, 0]
+
+    @torch.no_grad()
+    def render_values(
+        self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
+    ) -> Float[Tensor, "h w c"]:
+        """See `HasGaussians`; in the shapes of language."""
+        return self.model.render_values(camera, values, weight)
+
+    def point_cloud(self, cameras: Sequence[Camera]) -> PointCloud:
+        """See `HasGaussians`; the codes of all levels, whichever is asked."""
+        return point_cloud(self.model, cameras, self.color)
+
+    @cached_property
+    def _each(self) -> Sequence[Field]:
+        return [SplatField(self.model, self.color, level) for level in range(self.model.levels)]
+
+    @cached_property
+    def _fused(self) -> FusedGaussians:
+        """Fusion over colour and the codes of all levels, of which those that are asked are kept."""
+        with torch.no_grad():
+            fused = self.model.fuse()
+        if self.level is None:
+            return fused
+        weight = fused.language_weight
+        return replace(
+            fused,
+            feature=fused.feature.chunk(self.model.levels, dim=1)[self.level],
+            language_weight=weight if weight.dim() == 1 else weight[:, self.level].contiguous(),
+            level=self.level,
+        )
+
+    def _by_level(self, codes: Float[Tensor, "h w c"]) -> Float[Tensor, "levels h w d"]:
+        """Codes of the levels apart, which the model has side by side."""
+        return _stack(codes.split(self.model.codec.dim, dim=-1))
+
+    def _compare(
+        self, codes: Float[Tensor, "levels h w d"], words: Float[Tensor, "k e"]
+    ) -> Float[Tensor, "levels k h w"]:
+        decode = self.model.codec.decode
+        return _stack([decoded_cosines(decode, level, words) for level in codes])
+
+
+def _stack(parts: Sequence[Tensor]) -> Tensor:
+    """Along a new first axis; a single one, which may be large, is not copied."""
+    return parts[0][None] if len(parts) == 1 else torch.stack(list(parts))
