@@ -81,7 +81,7 @@ def build_module(
     else:
         parameters = start_from(config.init, config, width)
     language = scene.mask_vectors.shape[0] > 0
-    own = language and parts.sharing.means and not parts.sharing.covariances
+    own = language and parts.sharing.own_shape
     parameters = with_language_shape(parameters, own)
     several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
     parameters = with_level_indicators(parameters, scene.mask_levels if several else None)
