@@ -106,10 +106,10 @@ def text_encoder(config: DictConfig, scene: Any) -> Any:
     return text
 
 
-def make_stages(folder: Any, config: DictConfig, scenes: Scenes) -> Any:
+def make_workshop(folder: Any, config: DictConfig, scenes: Scenes) -> Any:
     """What trains the models of a run in its folder."""
     from vlgs.module.fit import FitOptions
-    from vlgs.module.stages import Stages
+    from vlgs.module.workshop import Workshop
 
     def make_options() -> FitOptions:
         meta = {
@@ -119,7 +119,18 @@ def make_stages(folder: Any, config: DictConfig, scenes: Scenes) -> Any:
         loggers = [instantiate(logger) for logger in config.logger.loggers]
         return FitOptions(meta=meta, progress=config.progress, loggers=loggers)
 
-    return Stages(folder, lambda: _make_parts(config), make_options, config.seed)
+    return Workshop(folder, lambda: _make_parts(config), make_options, config.seed)
+
+
+def stage_options(config: DictConfig) -> list[Any]:
+    """The options that a run's stages come from, in the order of these: further views, mask levels, models."""
+    from vlgs.module.levels import LEVEL_OPTIONS
+
+    return [
+        instantiate(config.augment),
+        LEVEL_OPTIONS[config.levels],
+        instantiate(config.sharing),
+    ]
 
 
 def rehearse(config: DictConfig, scenes: Scenes) -> None:
@@ -131,10 +142,10 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
         FloatingPointError: Likewise.
     """
     from vlgs.codec.autoencoder import Autoencoder
-    from vlgs.module.augment import NoAugment
     from vlgs.module.build import Parts
     from vlgs.module.fit import FitOptions
-    from vlgs.module.stages import Stages, train_all
+    from vlgs.module.stages import run_stages
+    from vlgs.module.workshop import Workshop
     from vlgs.report.evaluate import evaluate
     from vlgs.runs import RunFolder
 
@@ -153,9 +164,9 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
 
     with TemporaryDirectory() as scratch:
         options = FitOptions(meta={}, progress=False)
-        stages = Stages(RunFolder(Path(scratch)), make_parts, lambda: options, config.seed)
-        joint = config.levels == "joint"
-        field = train_all(stages, scenes, instantiate(config.sharing), NoAugment(), joint=joint)
+        workshop = Workshop(RunFolder(Path(scratch)), make_parts, lambda: options, config.seed)
+        _, *further = stage_options(config)  # views are not added: that takes as long as the run
+        field = run_stages(further, scenes, workshop).field()
     query, protocol = instantiate(config.query), instantiate(config.protocol)
     evaluate(field, replace(scene, test=scene.test[:1]), query, text, protocol)
 

@@ -20,7 +20,7 @@ from vlgs.command import check_command
 from vlgs.config import CONF, instantiate
 from vlgs.identity import RESULTS_VERSION, identity
 from vlgs.places import tidy_sweep, write_config
-from vlgs.prepare import Scenes, doubts, make_stages, prepare, text_encoder
+from vlgs.prepare import Scenes, doubts, make_workshop, prepare, stage_options, text_encoder
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 from vlgs.tables.multirun import note_run
 from vlgs.text import screen
@@ -122,21 +122,21 @@ def _run_in(folder: RunFolder, config: DictConfig, scenes: Scenes) -> int:
     if finished is not None:
         return _say(finished, folder, "already done, nothing computed")
     from vlgs.data.plausible import plausibility_warnings
-    from vlgs.module.stages import StoppedError, train_all
+    from vlgs.module.stages import run_stages
+    from vlgs.module.workshop import StoppedError
 
     scene = next(reversed(scenes.values()))
     for doubt in (*doubts(config), *plausibility_warnings(scene, (*scene.train, *scene.test))):
         log.warning("warning: %s", doubt)
     text = text_encoder(config, scene)
     write_config(folder.config, config)
-    stages = make_stages(folder, config, scenes)
+    workshop = make_workshop(folder, config, scenes)
     try:
-        sharing, augment = instantiate(config.sharing), instantiate(config.augment)
-        field = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
+        progress = run_stages(stage_options(config), scenes, workshop)
     except StoppedError as stop:
         log.warning("%s; the same command goes on from there:\n  %s", stop, _command())
         return STOPPED
-    return _say(_report(folder, config, scenes, field, stages, text), folder)
+    return _say(_report(folder, config, scenes, progress, workshop, text), folder)
 
 
 def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
@@ -151,13 +151,13 @@ def _report(
     folder: RunFolder,
     config: DictConfig,
     scenes: Scenes,
-    field: Any,
-    stages: Any,
+    progress: Any,
+    workshop: Any,
     text: Any,
 ) -> dict[str, Any]:
     """Evaluate the trained scene and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished."""
     from vlgs.fields.cloud import write_point_cloud
-    from vlgs.module.stages import all_skips
+    from vlgs.module.workshop import all_skips
     from vlgs.report.evaluate import evaluate
     from vlgs.report.pictures import write_pictures
     from vlgs.report.provenance import commit, machine
@@ -165,15 +165,15 @@ def _report(
     from vlgs.report.timing import measure_fps
     from vlgs.report.words import questions_of
 
-    scene = next(reversed(scenes.values()))
+    field, scene = progress.field(), next(reversed(scenes.values()))
     query, protocol = instantiate(config.query), instantiate(config.protocol)
-    done, kept = stages.done.values(), stages.kept
+    done, kept = workshop.made.values(), workshop.kept
     folder.require_own()
     trained_on = [view.camera for view in scene.train]
     written = [
-        stage.folder.ply
-        for stage in kept
-        if write_point_cloud(stage.folder.ply, stage.field, trained_on)
+        made.folder.ply
+        for made in kept
+        if write_point_cloud(made.folder.ply, made.field, trained_on)
     ]
     evaluation = evaluate(field, scene, query, text, protocol)
     asked = questions_of(field, scene, query, text)
@@ -181,7 +181,7 @@ def _report(
     if asked and asked.note:
         query = asked.query
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
-    if config.levels == "separate" and len(field.levels()) > 1:
+    if len(progress.scenes) > 1:
         first, *_, last = scenes
         whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
@@ -190,16 +190,16 @@ def _report(
     if config.pictures:
         write_pictures(folder.renders, field, scene, query, prompts)
     extra = {
-        "n_gaussians": sum(stage.model.count for stage in kept),
+        "n_gaussians": sum(made.gaussians for made in kept),
         "levels": [level for level in scenes if level is not None]
         if len(scene.mask_vectors)
         else [],
         "level_models": config.levels,
-        "train_seconds": sum(stage.seconds for stage in done),
+        "train_seconds": sum(made.seconds for made in done),
         "skips": all_skips(done).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         "ply_bytes": sum(path.stat().st_size for path in written) if written else None,
-        "checkpoint_bytes": sum(stage.checkpoint_bytes for stage in kept),
+        "checkpoint_bytes": sum(made.checkpoint_bytes for made in kept),
         "seed": config.seed,
         "config_hash": folder.path.name,
         "recipe": identity(config).recipe,

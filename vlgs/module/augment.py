@@ -16,10 +16,14 @@ from vlgs.data.sampler import nearest_views
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.fields.splat import SplatModel
 from vlgs.files import write_atomically
+from vlgs.module.stages import Progress, Stage, TrainColor
+from vlgs.module.workshop import Workshop
 from vlgs.types import Camera, Scene, View
 from vlgs.values import require_range
 
 _CAMERAS = 7  # purpose of draws
+_FIRST = "augment"
+"""Name of the stage that renders."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,10 @@ class NoAugment:
 
     def require(self, scenes: Mapping[int | None, Scene]) -> None:
         """See `Offline`."""
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """None."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,10 @@ class Offline:
                 )
             if self.extractor is not None and level is None:
                 raise ValueError("augment: data must have a mask level for the extractor, got none")
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """A first model of colour alone, and the views that it renders; see `vlgs.module.stages.Stages`."""
+        return [TrainColor(_FIRST, kept=False), RenderViews(self)]
 
     def extend(
         self, scenes: Mapping[int | None, Scene], model: SplatModel, seed: int, folder: Path
@@ -147,6 +159,22 @@ class Offline:
         rows, compact = index.unique(return_inverse=True)
         first = int(rows[0] < 0)
         return (compact - first).int(), every[rows[rows >= 0].long()]
+
+
+@dataclass(frozen=True)
+class RenderViews:
+    """Adds views that an earlier stage renders to the training views of every mask level."""
+
+    augment: Offline
+    start: str = _FIRST
+    """The earlier stage."""
+
+    def run(self, progress: Progress, workshop: Workshop) -> Progress:
+        """See `vlgs.module.stages.Stage`."""
+        model = progress.gaussians(self.start, None)
+        maps = workshop.folder.part(self.start).path / "language"
+        scenes = self.augment.extend(progress.scenes, model, workshop.seed, maps)
+        return replace(progress, scenes=scenes)
 
 
 def _with_views(

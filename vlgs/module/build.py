@@ -79,7 +79,7 @@ def build_module(
         config = replace(config, prune_on="opacity")
     width = codec.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
-    own = language and parts.sharing.means and not parts.sharing.covariances
+    own = language and parts.sharing.own_shape
     several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
     levels = scene.mask_levels if several else None
     attributes = attributes_of(config, width, levels, own, asdict(parts.trainer.learning_rates))
