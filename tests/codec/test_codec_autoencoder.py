@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from vlgs.codec import Codec
 from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
+from vlgs.data.synthetic.language import vocabulary
 
 CITYSCAPES = Path(__file__).parents[2] / (
     "../shared/data/clip_text_embeddings/semivl/cityscapes_single.npy"
@@ -51,11 +52,28 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-@pytest.fixture(scope="module")
-def camvid() -> tuple[Autoencoder, Tensor]:
-    if not CITYSCAPES.exists():
+@pytest.fixture(scope="module", params=["procedural", "real"])
+def camvid(request: pytest.FixtureRequest) -> tuple[Autoencoder, Tensor]:
+    """A codec, and the vectors of the eleven classes of a street that it was fitted to."""
+    if request.param == "procedural":
+        words = (
+            "sky",
+            "building",
+            "pole",
+            "road",
+            "pavement",
+            "tree",
+            "sign",
+            "fence",
+            "car",
+            "pedestrian",
+            "bicyclist",
+        )
+        classes = vocabulary(words).vectors[:11]
+    elif CITYSCAPES.exists():
+        classes = normalize(torch.from_numpy(np.load(CITYSCAPES)[CAMVID].astype(np.float32)))
+    else:
         pytest.skip("real text embeddings not at hand")
-    classes = normalize(torch.from_numpy(np.load(CITYSCAPES)[CAMVID].astype(np.float32)))
     codec = Autoencoder()
     vectors, areas, _ = masks(classes, 60, seed=2)
     codec.fit(vectors, areas)
