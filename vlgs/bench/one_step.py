@@ -6,11 +6,10 @@ from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from time import perf_counter, process_time
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 from torch import Tensor
 
-from vlgs.bench.clock import Pass
+from vlgs.bench.clock import Pass, replaced
 from vlgs.bench.outcome import Outcome
 from vlgs.fusion.none import NoFusion
 from vlgs.module.blended import BlendPlan
@@ -93,8 +92,8 @@ def run_step(module: VLGSModule, step: int) -> Pass:
 
     right, next_step = module._backward, module.next_step
     with ExitStack() as patches:
-        patches.enter_context(patch.object(module, "_backward", backward))
-        patches.enter_context(patch.object(module.optimizer, "step", mark))
+        patches.enter_context(replaced(module, "_backward", backward))
+        patches.enter_context(replaced(module.optimizer, "step", mark))
         mark()
         module.training_step(step, 0)
     module.next_step = next_step
@@ -121,7 +120,7 @@ def measure_step(module: VLGSModule, step: int) -> Step:
             blended.append(loss.item() / plan.weight)
         return loss
 
-    with patch.object(module, "_blended_loss", watched):
+    with replaced(module, "_blended_loss", watched):
         run_step(module, step)
     images = [i for r in module.report.renders for i in (r.color, r.feature) if i is not None]
     gradients = {
