@@ -4,17 +4,16 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from hydra import compose, initialize_config_dir
 from rich.table import Table
 
-from vlgs.config import CONF, instantiate
-from vlgs.module.build import Parts, build_module
+from vlgs.bench.clock import replaced
+from vlgs.bench.presets import build, composed
+from vlgs.experiment import construct
 from vlgs.module.lightning import VLGSModule
 from vlgs.ops import attention, blend, project, view_color
 
@@ -87,7 +86,7 @@ def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
         for owner, name, part in _timed(module):
             call = watch.around(part, getattr(owner, name))
             made = staticmethod(call) if isinstance(owner, type) else call
-            patches.enter_context(patch.object(owner, name, made))
+            patches.enter_context(replaced(owner, name, made))
         first = size.sh_degree * module.settings.sh_every
         statistics = watch.around("densification statistics", _gather_statistics)
         step = watch.around("step, what is left", module.training_step)
@@ -168,7 +167,5 @@ def _module(size: IterationSize) -> VLGSModule:
         f"data.height={size.height}",
         f"data.points={size.gaussians}",
     ]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=overrides)
-    parts = Parts(**{part.name: instantiate(config[part.name]) for part in fields(Parts)})
-    return build_module(instantiate(config.data), parts, config.seed)
+    experiment = construct(composed(overrides))
+    return build(experiment, experiment.read_scene())

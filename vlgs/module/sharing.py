@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
+from vlgs.demands import Demand
 from vlgs.module.separate import for_language, unite
 from vlgs.module.stages import Lift, Progress, Stage, Train, TrainColor
 from vlgs.module.workshop import Workshop
@@ -47,6 +49,14 @@ class OneModel:
 class TwoModels:
     """Two sets of Gaussians that know nothing of each other."""
 
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand(
+            "sharing=none",
+            "fusion",
+            "separable",
+            "as a Gaussian then carries colour or language but not both",
+        ),
+    )
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`; the Gaussians of language are its own altogether."""
 
@@ -60,6 +70,10 @@ class TwoModels:
 class Lifted:
     """One set of Gaussians that colour alone has placed; they are given language in the end."""
 
+    demands: ClassVar[Sequence[Demand]] = tuple(
+        Demand("sharing=lifted", group, "untrained", "as nothing trains it")
+        for group in ("fusion", "indicator")
+    )
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`."""
 
