@@ -122,11 +122,17 @@ def _check_root(config: DictConfig) -> None:
     if not config.results:
         raise ValueError("config: results must be a folder, got ''")
     _require_place(config.results)
-    loggers = config.logger.get("loggers")
-    if not isinstance(loggers, ListConfig) or not all(
-        isinstance(one, DictConfig) and "_target_" in one for one in loggers
-    ):
-        raise ValueError(f"config: logger.loggers must be a list of loggers, got {loggers}")
+    for key in ("logger.loggers", "stages"):
+        parts, name = OmegaConf.select(config, key), last(key)
+        if not ((key == "stages" and parts is None) or _are_parts(parts)):
+            raise ValueError(f"config: {key} must be a list of {name}, got {parts}")
+
+
+def _are_parts(node: Any) -> bool:
+    """Whether a node is a list of things to construct."""
+    return isinstance(node, ListConfig) and all(
+        isinstance(one, DictConfig) and "_target_" in one for one in node
+    )
 
 
 def instantiate(config: Any, **arguments: Any) -> Any:

@@ -7,22 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import get_object
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
-from vlgs import demands
 from vlgs.config import instantiate
-from vlgs.demands import Demand, unmet
+from vlgs.demands import Demand, has, unmet
 from vlgs.identity import GIVEN_FILES, Identity, identity, run_id
-from vlgs.known import CONF, contents, is_group, option, options
+from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.module.augment import NoAugment, Offline
 from vlgs.module.build import Parts
 from vlgs.module.levels import LEVEL_OPTIONS, Levels
 from vlgs.module.sharing import Lifted, OneModel, TwoModels
-from vlgs.module.stages import Stages
+from vlgs.module.stages import Method, Stages
 from vlgs.places import record
 from vlgs.query import Query, TextEncoder
 from vlgs.types import Scene
@@ -40,6 +39,8 @@ class Experiment:
     make_parts: Callable[[], Parts]
     """Parts to be trained: new ones for each model, with the same initial weights each time."""
     sharing: OneModel | TwoModels | Lifted
+    method: Method | None
+    """Stages in place of those of `sharing`."""
     augment: NoAugment | Offline
     levels: Levels
     level_models: str
@@ -84,7 +85,7 @@ class Experiment:
 
     def stages(self) -> list[Stages]:
         """The options that the stages come from, in the order of these: further views, mask levels, models."""
-        return [self.augment, self.levels, self.sharing]
+        return [self.augment, self.levels, self.method or self.sharing]
 
 
 def construct(config: DictConfig) -> Experiment:
@@ -100,6 +101,7 @@ def construct(config: DictConfig) -> Experiment:
         parts=parts,
         make_parts=make_parts,
         sharing=instantiate(config.sharing),
+        method=_method(config),
         query=instantiate(config.query),
         protocol=instantiate(config.protocol),
         make_text=instantiate(config.text),
@@ -122,7 +124,8 @@ def construct(config: DictConfig) -> Experiment:
         run_id=partial(run_id, config),
     )
     chosen = {field.name: getattr(parts, field.name) for field in fields(Parts)}
-    chosen |= {"augment": experiment.augment, "levels": experiment.levels}
+    for key in ("augment", "levels", "method"):
+        chosen[key] = getattr(experiment, key)
     for demand in unmet(chosen):
         raise ValueError(_refusal(config, demand))
     return experiment
@@ -132,6 +135,11 @@ def _make_parts(config: DictConfig) -> Parts:
     # Initial weights of the fusion come from the global generator; every other draw has one of its own.
     torch.manual_seed(config.seed)
     return Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+
+
+def _method(config: DictConfig) -> Method | None:
+    stages = config.get("stages")
+    return None if stages is None else Method([instantiate(stage) for stage in stages])
 
 
 def _given_files(config: DictConfig) -> dict[str, str]:
@@ -149,24 +157,19 @@ def _dataset(config: DictConfig) -> str:
 def _refusal(config: DictConfig, demand: Demand) -> str:
     """Names both options, and those that would do."""
     group, why = demand.group, f", {demand.why}" if demand.why else ""
-    fitting = " or ".join(name for name in _options_having(group, demand.needed))
-    return (
-        f"config: {group} must be {fitting} with {demand.asker}{why}, got {_chosen(config, group)}"
-    )
-
-
-def _options_having(group: str, needed: str) -> list[str]:
     if group == "levels":
-        return [name for name, levels in LEVEL_OPTIONS.items() if demands.has(levels, needed)]
-    named = {name: contents(CONF / group / f"{name}.yaml") for name in options(group)}
-    classes = {
-        name: get_object(said["_target_"]) for name, said in named.items() if "_target_" in said
-    }
-    return [name for name, made in classes.items() if demands.has(made, needed)]
+        fitting = [name for name, levels in LEVEL_OPTIONS.items() if has(levels, demand.needed)]
+        got = str(config.levels)
+    else:
+        each = _options(group)
+        fitting = [name for name, said in each.items() if has(instantiate(said), demand.needed)]
+        target = str(config[group]._target_)
+        same = (name for name, said in each.items() if said == config[group])
+        got = next(same, None) or option(group, target) or target
+    return f"config: {group} must be {' or '.join(fitting)} with {demand.asker}{why}, got {got}"
 
 
-def _chosen(config: DictConfig, group: str) -> str:
-    if not is_group(group):
-        return str(config[group])
-    target = str(config[group]._target_)
-    return option(group, target) or target
+def _options(group: str) -> dict[str, DictConfig]:
+    """Every option of a group of ours, as it is by default."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return {name: compose("config", [f"{group}={name}"])[group] for name in options(group)}

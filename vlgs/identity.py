@@ -62,6 +62,7 @@ GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
+    "stages": None,
     "trainer.exposure": False,
     "trainer.learning_rates.exposure": 1e-3,
 }

@@ -1,7 +1,7 @@
 """What colour and language have in common (Table 17; conf/README.md, D.16): the options of conf/sharing, and the stages of each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from vlgs.demands import Demand
@@ -37,6 +37,8 @@ def choose_sharing(
 class OneModel:
     """One set of Gaussians for both."""
 
+    replaceable: ClassVar[bool] = True
+    """A method's own stages may take the place of these."""
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`."""
 
@@ -71,8 +73,7 @@ class Lifted:
     """One set of Gaussians that colour alone has placed; they are given language in the end."""
 
     demands: ClassVar[Sequence[Demand]] = tuple(
-        Demand("sharing=lifted", group, "untrained", "as nothing trains it")
-        for group in ("fusion", "indicator")
+        replace(demand, asker="sharing=lifted") for demand in Lift.demands
     )
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`."""
