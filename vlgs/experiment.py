@@ -17,10 +17,9 @@ from vlgs.demands import Demand, has, unmet
 from vlgs.identity import GIVEN_FILES, Identity, identity, run_id
 from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
-from vlgs.module.augment import NoAugment, Offline
+from vlgs.module.augment import Augment
 from vlgs.module.build import Parts
 from vlgs.module.levels import LEVEL_OPTIONS, Levels
-from vlgs.module.sharing import Lifted, OneModel, TwoModels
 from vlgs.module.stages import Method, Stages
 from vlgs.places import record
 from vlgs.query import Query, TextEncoder
@@ -38,10 +37,10 @@ class Experiment:
     """To be looked at, not to be trained."""
     make_parts: Callable[[], Parts]
     """Parts to be trained: new ones for each model, with the same initial weights each time."""
-    sharing: OneModel | TwoModels | Lifted
+    sharing: Stages
     method: Method | None
     """Stages in place of those of `sharing`."""
-    augment: NoAugment | Offline
+    augment: Augment
     levels: Levels
     level_models: str
     """What the command line calls `levels`."""

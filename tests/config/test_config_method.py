@@ -95,6 +95,8 @@ def test_a_method_runs(chosen, tmp_path: Path):
         (["method=lift", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
         (["stages=[3]"], "config: stages must be a list of stages, got"),
         (["stages=[{_target_: vlgs.module.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
+        (["stages=[{_target_: vlgs.module.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),
+        (["stages=[{_target_: vlgs.module.stages.Train, name: renders}]"], r"none of augment, .*got 'renders'"),
         (["stages=[]"], "stages: there must be at least one, got none"),
         (["stages=[{_target_: vlgs.run.run}]"], "stages.0._target_ must be one of"),
     ],

@@ -7,6 +7,7 @@ A stage makes each of its models in a sub-folder of the run, named after the mas
 read back, one that is not goes on from its checkpoint: the same command continues where it was stopped, with the same bits.
 """
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol, runtime_checkable
@@ -19,6 +20,9 @@ from vlgs.render.level import by_level
 from vlgs.render.model import SplatModel
 from vlgs.report.answer import ViewModel
 from vlgs.types import Scene
+
+_TAKEN = ("augment", "checkpoint", "renders")
+"""Folders of a run that are no stage's of a method."""
 
 Level = int | None
 """A mask level; None where a scene has no levels, or where something is of all levels."""
@@ -111,6 +115,10 @@ class Method:
                 _require_earlier(start, names)
             if name in names:
                 raise ValueError(f"stages: name must differ from those before it, got {name!r}")
+            if name in _TAKEN or not re.fullmatch(r"[a-z0-9_]*", name or ""):
+                raise ValueError(
+                    f"stages: name must be of small letters, digits and _, and none of {', '.join(_TAKEN)}, got {name!r}"
+                )
             names += [] if name is None else [name]
         if not self.listed:
             raise ValueError("stages: there must be at least one, got none")
