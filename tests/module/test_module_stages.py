@@ -18,7 +18,16 @@ from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions
 from vlgs.module.levels import LEVEL_OPTIONS, JoinLevels
 from vlgs.module.sharing import TrainLanguage, Unite, choose_sharing
-from vlgs.module.stages import Lift, Progress, Stage, Train, TrainColor, list_stages, run_stages
+from vlgs.module.stages import (
+    Lift,
+    Method,
+    Progress,
+    Stage,
+    Train,
+    TrainColor,
+    list_stages,
+    run_stages,
+)
 from vlgs.module.workshop import Workshop
 from vlgs.runs import RunFolder
 from vlgs.types import Camera, Scene
@@ -28,16 +37,6 @@ ONE, TWO = choose_sharing(), choose_sharing(means=False, covariances=False)
 LIFTED = choose_sharing(lifted=True)
 OFFLINE = Offline(views=2)
 COLOR, GEOMETRY = TrainColor("color"), TrainColor("geometry", kept=False)
-
-
-@dataclass(frozen=True)
-class Method:
-    """An ordered list of stages."""
-
-    listed: tuple[Stage, ...]
-
-    def stages(self, language: bool) -> tuple[Stage, ...]:
-        return self.listed
 
 
 def workshop_in(folder: Path, *overrides: str) -> Workshop:
@@ -135,8 +134,10 @@ class Grey:
 class MakeGrey:
     """A stage that is no splat at all."""
 
+    name: str = "grey"
+
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
-        return progress.having("grey", {None: Grey()})
+        return progress.having(self.name, {None: Grey()})
 
 
 def test_a_stage_may_make_something_else_than_gaussians(tiny_scene: Scene, tmp_path: Path):

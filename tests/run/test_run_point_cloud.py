@@ -11,6 +11,7 @@ import torch
 from tiny_runs import TINY, composed
 from viewer_3dgs import C0, Pinhole, draw_color, draw_language, read_columns, read_rows
 
+import vlgs.prepare
 import vlgs.run
 from vlgs.config import CONF, instantiate
 from vlgs.convert import convert
@@ -70,13 +71,13 @@ class Done:
 @pytest.fixture
 def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
     kept: list[Workshop] = []
-    original = vlgs.run.make_workshop
+    original = vlgs.prepare.make_workshop
 
     def keeping(*arguments: object) -> Workshop:
         kept.append(original(*arguments))  # type: ignore[arg-type]
         return kept[-1]
 
-    monkeypatch.setattr(vlgs.run, "make_workshop", keeping)
+    monkeypatch.setattr(vlgs.prepare, "make_workshop", keeping)
 
     def go(*overrides: str) -> Done:
         assert vlgs.run.run(composed(*SHORT, *overrides, f"results={tmp_path}")) == 0

@@ -144,11 +144,14 @@ def tensors_of(folder: RunFolder) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["sharing=none"], "fusion must be none with sharing=none.*got vlgs.fusion.*SelfAttention"),
+        (["sharing=none"], "fusion must be none with sharing=none, as .* not both, got self"),
         (["levels=both"], "levels must be single or separate or joint, got both"),
         (["indicator=per_level"], "levels must be joint with indicator=per_level, got single"),
-        (["sharing=lifted"], "fusion must be .*NoFusion with sharing=lifted"),
-        (["sharing=lifted", "fusion=none"], "indicator must be .*ColourOpacity or .*Fixed with"),
+        (["sharing=lifted"], "fusion must be none with sharing=lifted, as .*, got self"),
+        (
+            ["sharing=lifted", "fusion=none"],
+            "indicator must be fixed or opacity with sharing=lifted",
+        ),
         (["augment=offline", "augment.views=0"], "views must be 1 to 100000, got 0"),
     ],
 )

@@ -4,7 +4,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from vlgs.data.sampler import nearest_views
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.fields.splat import SplatModel
 from vlgs.files import write_atomically
-from vlgs.module.stages import Progress, Stage, TrainColor
+from vlgs.module.stages import Progress, Stage, Stages, TrainColor
 from vlgs.module.workshop import Workshop
 from vlgs.types import Camera, Scene, View
 from vlgs.values import require_range
@@ -35,16 +35,29 @@ class Shot:
     image: UInt8[Tensor, "h w 3"]
 
 
+@runtime_checkable
+class Augment(Stages, Protocol):
+    """The interface of an option of conf/augment."""
+
+    def identity(self) -> str:
+        """What moves the added views besides the configuration; counts for the id of a run."""
+        ...
+
+    def require(self, scenes: Mapping[int | None, Scene]) -> None:
+        """Refuse scenes that no views can be added to, before anything is trained."""
+        ...
+
+
 @dataclass(frozen=True)
 class NoAugment:
     """The training views alone."""
 
     def identity(self) -> str:
-        """See `Offline`."""
+        """See `Augment`."""
         return ""
 
     def require(self, scenes: Mapping[int | None, Scene]) -> None:
-        """See `Offline`."""
+        """See `Augment`."""
 
     def stages(self, language: bool) -> Sequence[Stage]:
         """None."""

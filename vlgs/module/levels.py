@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 from vlgs.config import LEVELS
 from vlgs.module.joint import join_levels
@@ -53,6 +53,8 @@ class Separate:
 class Joint:
     """One model for all mask levels."""
 
+    joint: ClassVar[bool] = True
+    """A model has something of its own for each level."""
     read: Sequence[int] = LEVELS
     codes: int = len(LEVELS)
 

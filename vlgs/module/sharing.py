@@ -1,8 +1,10 @@
 """What colour and language have in common (Table 17; conf/README.md, D.16): the options of conf/sharing, and the stages of each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
+from vlgs.demands import Demand
 from vlgs.fields.trained import SplatField
 from vlgs.module.separate import for_language, unite
 from vlgs.module.stages import Lift, Progress, Stage, Train, TrainColor
@@ -35,6 +37,8 @@ def choose_sharing(
 class OneModel:
     """One set of Gaussians for both."""
 
+    replaceable: ClassVar[bool] = True
+    """A method's own stages may take the place of these."""
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`."""
 
@@ -47,6 +51,14 @@ class OneModel:
 class TwoModels:
     """Two sets of Gaussians that know nothing of each other."""
 
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand(
+            "sharing=none",
+            "fusion",
+            "separable",
+            "as a Gaussian then carries colour or language but not both",
+        ),
+    )
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`; the Gaussians of language are its own altogether."""
 
@@ -60,6 +72,9 @@ class TwoModels:
 class Lifted:
     """One set of Gaussians that colour alone has placed; they are given language in the end."""
 
+    demands: ClassVar[Sequence[Demand]] = tuple(
+        replace(demand, asker="sharing=lifted") for demand in Lift.demands
+    )
     own_shape: bool = False
     """See `vlgs.gaussians.Sharing`."""
 

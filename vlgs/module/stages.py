@@ -7,10 +7,12 @@ A stage makes each of its models in a sub-folder of the run, named after the mas
 read back, one that is not goes on from its checkpoint: the same command continues where it was stopped, with the same bits.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
+from vlgs.demands import Demand
 from vlgs.fields import Field
 from vlgs.fields.several import SeveralFields
 from vlgs.fields.splat import SplatModel
@@ -19,6 +21,9 @@ from vlgs.module.build import Parts
 from vlgs.module.separate import without_language
 from vlgs.module.workshop import Workshop, unchanged
 from vlgs.types import Scene
+
+_TAKEN = ("augment", "checkpoint", "renders")
+"""Folders of a run that are no stage's of a method."""
 
 Level = int | None
 """A mask level; None where a scene has no levels, or where something is of all levels."""
@@ -44,9 +49,7 @@ class Progress:
         Raises:
             ValueError: If no stage of that name came before.
         """
-        if name not in self.models:
-            known = ", ".join(map(repr, self.models)) or "none"
-            raise ValueError(f"stages: start must be an earlier stage ({known}), got {name!r}")
+        _require_earlier(name, self.models)
         models = self.models[name]
         return models[level] if level in models else models[None]
 
@@ -93,6 +96,44 @@ class Stages(Protocol):
     def stages(self, language: bool) -> Sequence[Stage]:
         """The option's part of the list; `language` is off where a scene has nothing to learn it from."""
         ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """The stages that a configuration lists, in place of those of ``sharing``.
+
+    Raises:
+        ValueError: If a stage starts from one that does not come before it, two have one name, or there is none.
+    """
+
+    listed: Sequence[Stage]
+
+    def __post_init__(self) -> None:
+        names: list[str] = []
+        for stage in self.listed:
+            name, start = getattr(stage, "name", None), getattr(stage, "start", None)
+            if start is not None:
+                _require_earlier(start, names)
+            if name in names:
+                raise ValueError(f"stages: name must differ from those before it, got {name!r}")
+            if name in _TAKEN or not re.fullmatch(r"[a-z0-9_]*", name or ""):
+                raise ValueError(
+                    f"stages: name must be of small letters, digits and _, and none of {', '.join(_TAKEN)}, got {name!r}"
+                )
+            names += [] if name is None else [name]
+        if not self.listed:
+            raise ValueError("stages: there must be at least one, got none")
+
+    @property
+    def demands(self) -> Sequence[Demand]:
+        """Those of its stages, and that nothing else says how models are made."""
+        asked = [demand for stage in self.listed for demand in getattr(stage, "demands", ())]
+        why = "as the stages say how models are made"
+        return [Demand("stages of a method", "sharing", "replaceable", why), *asked]
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """See `Stages`."""
+        return self.listed
 
 
 def run_stages(
@@ -174,6 +215,10 @@ class TrainColor:
 class Lift:
     """Gives every Gaussian of an earlier stage the mean code of the masked pixels that it is blended into; nothing is trained."""
 
+    demands: ClassVar[Sequence[Demand]] = tuple(
+        Demand("language that is lifted", group, "untrained", "as nothing trains it")
+        for group in ("fusion", "indicator")
+    )
     start: str
     """The earlier stage."""
     name: str = ""
@@ -189,3 +234,9 @@ class Lift:
             else:
                 models[level] = workshop.train(folder, scene)
         return progress.having(self.name, models)
+
+
+def _require_earlier(name: str, known: Collection[str]) -> None:
+    if name not in known:
+        listed = ", ".join(map(repr, known)) or "none"
+        raise ValueError(f"stages: start must be an earlier stage ({listed}), got {name!r}")
