@@ -35,7 +35,6 @@ NAMES = {
     "fusion": "cross mlp none self",
     "gaussians": "default",
     "indicator": "fixed learned opacity per_level",
-    "loss": "default",
     "protocol": "auto dense lerf_ovs mipnerf360_goi ovs3d_argmax ovs3d_threshold select3d",
     "query": "lerf_relevancy vocab_softmax",
     "raster": "default",

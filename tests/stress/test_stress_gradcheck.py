@@ -59,6 +59,11 @@ NO_GRADIENT = {
     "vlgs.fusion.Fusion.__call__": "protocol",
     "vlgs.codec.Codec.encode": "protocol",
     "vlgs.codec.Codec.decode": "protocol",
+    **{f"vlgs.objectives.{name}": "adds up the losses and renders that are checked" for name in (
+        "objective.Objective.__call__", "photometric.Photometric.__call__", "language.Language.__call__",
+        "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss",
+    )},
+    "vlgs.objectives.targets.covered": "a mask",
     "vlgs.gaussians.parameters.at_levels": "before training",
     "vlgs.gaussians.parameters.complete": "before training",
     "vlgs.gaussians.parameters.conform": "before training",
