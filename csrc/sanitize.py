@@ -1,6 +1,6 @@
 """Fuzz the kernels under AddressSanitizer and UndefinedBehaviorSanitizer: `python csrc/sanitize.py --isa v4 --scenes 10000`.
 
-Builds the extension apart, in build/sanitize, with the instruction sets asked for, and runs `vlgs.bench.fuzz` on each: seeds from 0 on,
+Builds the extension apart, in build/sanitize, with the instruction sets asked for, and runs `tests.fuzz_kernel` on each: seeds from 0 on,
 in parts, each recorded in results/bench/fuzz.csv when it ends and not run again on the same code. The first finding ends a part
 with the sanitizer's report; the seed that it was in is named. `--first SEED --scenes 1` runs one scene again and records nothing.
 """
@@ -40,8 +40,8 @@ def fuzz_here(module: Path, isa: str, seeds: range) -> None:
     assert spec.loader is not None
     sys.modules["vlgs._csrc"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules["vlgs._csrc"])
+    from tests.fuzz_kernel import fuzz
     from vlgs import _csrc
-    from vlgs.bench.fuzz import fuzz
 
     assert _csrc.__file__ == str(module)
     if _csrc.isa() != isa:
@@ -51,7 +51,7 @@ def fuzz_here(module: Path, isa: str, seeds: range) -> None:
 
 def fuzz_in_child(module: Path, isa: str, seeds: range):
     """A report of some seeds; a process that ended before its report failed in the seed it had announced last."""
-    from vlgs.bench.fuzz import FuzzReport
+    from tests.fuzz_kernel import FuzzReport
 
     found = [subprocess.check_output(["gcc", f"-print-file-name={r}"], text=True) for r in RUNTIMES]
     environment = os.environ | {
@@ -85,10 +85,11 @@ def main() -> None:
     parser.add_argument("--isa", nargs="+", default=["v4", "v3", "base"])
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    sys.path.append(str(SOURCE.parent))  # of tests, which are not installed
     seeds = range(args.first or 0, (args.first or 0) + args.scenes)
     if args.child:
         return fuzz_here(args.child, args.isa[0], seeds)
-    from vlgs.bench.fuzz_sheet import CLEAN, run_fuzz
+    from tests.fuzz_kernel.sheet import CLEAN, run_fuzz
 
     module, failed = build(args.isa), False
     for isa in args.isa:

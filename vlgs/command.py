@@ -20,7 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vlgs.config import check_targets
-from vlgs.known import CONF, contents, groups, join, near, options, place
+from vlgs.known import CONF, contents, groups, join, near, options, place, renamed
 from vlgs.manual import describe
 from vlgs.targets import check_hydra, require_plugins
 
@@ -205,7 +205,8 @@ def _explain(overrides: Sequence[Override], name: str, extra: Path | None) -> No
         if override.type == OverrideType.ADD and key in known:
             raise ValueError(f"command: {key} must be given without +, got {override.input_line}")
         if override.type == OverrideType.CHANGE and key not in known:
-            hint = _elsewhere(key) or _meant(key, known)
+            now = renamed(key)
+            hint = f"; it is called {now} now" if now else _elsewhere(key) or _meant(key, known)
             raise ValueError(f"config: {key} must be a key, got one that is not there{hint}")
 
 

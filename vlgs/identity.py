@@ -10,8 +10,10 @@ data and `RESULTS_VERSION`.
 - Every value counts that is not in `MOVES_NOTHING`. Defaults count like values that are given, so that a default can change
   without two different runs sharing an id. 1 and 1.0 are the same.
 - A key that is new, or goes, changes no id where it has the value in `AS_WITHOUT`.
+- What stands at a key whose children a user names (`vlgs.known.OPEN`) counts by being there, too.
+- A key that was renamed counts by its former name (`vlgs.known.FORMER`).
 
-Renaming a group, an option or a key does change ids: rows of results/ have to be carried over then.
+Renaming an option does change ids: rows of results/ have to be carried over then.
 """
 
 import hashlib
@@ -23,7 +25,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.known import is_group, join, last, option, targets
+from vlgs.known import OPEN, former, is_group, join, last, option, targets
 
 RESULTS_VERSION = 4
 """Part of every run id; raised by a change that can move a number."""
@@ -62,6 +64,7 @@ GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
 
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
+    **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "trainer.exposure": False,
     "trainer.learning_rates.exposure": 1e-3,
 }
@@ -121,7 +124,9 @@ def _without_files(plain: Mapping[str, Any]) -> dict[str, Any]:
 
 def _counted(node: Any, key: str = "") -> dict[str, Any]:
     """Dotted keys and values of what can move a number; a class stands as its option at its own key."""
-    leaves = dict(_leaves(node, key))
+    leaves = {former(k): v for k, v in _leaves(node, key)}
+    if not key:
+        leaves["loss"] = "default"  # as the group counted while one class held all terms
     return {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
 
 
@@ -138,10 +143,14 @@ def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
             yield from _leaves(child, join(key, name))
 
 
-def _class(key: str, target: str) -> Iterator[tuple[str, str]]:
+def _class(key: str, target: str) -> Iterator[tuple[str, str | bool]]:
     """What a class counts by; nothing where no other class of ours can stand."""
     name = option(key, target, _own_folders())
-    if name is not None:
+    if key.rpartition(".")[0] in OPEN:
+        yield key, True
+        if target not in targets(last(key)):
+            yield join(key, "_target_"), target
+    elif name is not None:
         yield key, name
     elif is_group(key) or target not in targets(last(key)):
         yield join(key, "_target_"), target

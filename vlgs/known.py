@@ -19,6 +19,17 @@ CONF = _INSIDE if (_INSIDE / "config.yaml").is_file() else _INSIDE.parents[1] / 
 """Folder of the configuration: inside the package in an installed wheel, beside it in a checkout. What lies beside an installed
 package (``site-packages/conf``) is somebody else's."""
 
+OPEN = frozenset({"gaussians.attributes", "loss"})
+"""Keys whose children a user names: objectives, further attributes of a Gaussian."""
+
+FORMER: Mapping[str, str] = {
+    "loss.photometric.error": "loss.rgb_loss",
+    "loss.language.error": "loss.lang_loss",
+    "loss.language.pixels": "loss.lang_pixels",
+    "loss.blended_view.weight": "loss.blend_weight",
+}
+"""Key, with all that is below it -> what it was called before. Ids of runs have the old name; whoever writes it is told the new one."""
+
 _LOGGERS = frozenset(
     f"lightning.pytorch.loggers.{name}Logger"
     for name in ("CSV", "Comet", "MLFlow", "Neptune", "TensorBoard", "Wandb")
@@ -137,6 +148,25 @@ def unread(config: Mapping[str, Any], name: str = "config") -> Iterator[tuple[st
             yield from _unread_in(str(key), value)
 
 
+def former(key: str) -> str:
+    """What a key was called before, or itself.
+
+    Example:
+        >>> former("loss.photometric.error"), former("fusion.width")
+        ('loss.rgb_loss', 'fusion.width')
+    """
+    return next((old + key[len(new) :] for new, old in FORMER.items() if _below(key, new)), key)
+
+
+def renamed(key: str) -> str | None:
+    """What a key is called now that was called so before; None if none was."""
+    return next((new + key[len(old) :] for new, old in FORMER.items() if _below(key, old)), None)
+
+
+def _below(key: str, place: str) -> bool:
+    return key == place or key.startswith(f"{place}.")
+
+
 def near(word: str, words: Collection[str]) -> list[str]:
     """The words that a mistyped one could have been, the likeliest first."""
     return difflib.get_close_matches(word, sorted(words), n=3, cutoff=0.6)
@@ -191,10 +221,10 @@ def _unread_in(key: str, node: Any) -> Iterator[tuple[str, list[str]]]:
     if target is None:
         known = {k.rpartition(".")[2] for k in _schema().keys if k.rpartition(".")[0] == key}
     for name, child in node.items():
-        if name not in known:
-            meant = near(str(name), known)
-            yield join(key, name), [join(key, other) for other in meant]
-        else:
+        if name not in known and not (key in OPEN and isinstance(child, Mapping)):
+            now, meant = renamed(join(key, name)), near(str(name), known)
+            yield join(key, name), [now] if now else [join(key, other) for other in meant]
+        elif key != "gaussians.attributes":  # whose values `vlgs.gaussians.GaussiansConfig` judges
             yield from _unread_in(join(key, name), child)
 
 

@@ -1,11 +1,8 @@
-"""What is minimised: Eqs. 8, 11 and 12, and alternatives to them (conf/README.md, D.8).
+"""Errors of images and maps, which objectives minimise: those of Eqs. 8, 11 and 12, and alternatives to them (conf/README.md, D.8).
 
 Images and maps are ``[h, w, c]``. A mask says which pixels count. The target's values at all other pixels are never read; they
 may even be NaN.
 """
-
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -139,68 +136,6 @@ def view_similarity(image1: Float[Tensor, "h w c"], image2: Float[Tensor, "h w c
         torch.set_num_threads(threads)
 
 
-@dataclass(frozen=True)
-class Losses:
-    """The terms of Eq. 12; the defaults are the paper's.
-
-    Raises:
-        ValueError: If a value is not one of those listed or the weight is negative.
-    """
-
-    rgb_loss: Literal["mse", "l1_dssim"] = "mse"
-    lang_loss: Literal["mse", "l1", "cos"] = "mse"
-    lang_pixels: Pixels = "valid"
-    blend_weight: float = 1.2
-    """lambda of Eq. 12."""
-
-    def __post_init__(self) -> None:
-        _require_choice("rgb_loss", self.rgb_loss, ("mse", "l1_dssim"))
-        _require_choice("lang_loss", self.lang_loss, tuple(_LANGUAGE))
-        _require_choice("lang_pixels", self.lang_pixels, ("valid", "all"))
-        if not 0 <= self.blend_weight < float("inf"):
-            raise ValueError(
-                f"Losses: blend_weight must be finite and >= 0, got {self.blend_weight}"
-            )
-
-    def color_loss(
-        self,
-        color: Float[Tensor, "h w 3"],
-        image: Float[Tensor, "h w 3"],
-        valid: Bool[Tensor, "h w"] | None = None,
-    ) -> Float[Tensor, ""]:
-        """First term of Eq. 8; `valid` are the pixels that the photograph covers."""
-        return (masked_mse if self.rgb_loss == "mse" else l1_dssim)(color, image, valid)
-
-    def language_loss(
-        self,
-        feature: Float[Tensor, "h w d"],
-        target: Float[Tensor, "h w d"],
-        valid: Bool[Tensor, "h w"] | None = None,
-    ) -> Float[Tensor, ""]:
-        """Second term of Eq. 8; `valid` are the pixels that have a language code."""
-        return _LANGUAGE[self.lang_loss](feature, target, valid, self.lang_pixels)
-
-    def blended_loss(
-        self,
-        feature: Float[Tensor, "h w d"],
-        target: Float[Tensor, "h w d"],
-        valid: Bool[Tensor, "h w"] | None,
-        similarity: float,
-    ) -> Float[Tensor, ""]:
-        """``lambda L_b``: what the blended view adds to Eq. 12.
-
-        Args:
-            feature: Language rendered from the blended camera.
-            target: From `vlgs.blend.blend_targets`, as is `valid`.
-            valid: Pixels that count.
-            similarity: `view_similarity` of the pair; 1 where ``blend.ssim`` is off.
-        """
-        return self.blend_weight * similarity * self.language_loss(feature, target, valid)
-
-
-_LANGUAGE = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
-
-
 def _filled(target: Tensor, valid: Tensor, render: Tensor) -> Tensor:
     """The target, or where it does not count the render itself, which leaves neither an error nor a gradient."""
     return torch.where(valid[..., None], target, render.detach())
@@ -211,11 +146,6 @@ def _count(error: Tensor, valid: Tensor, pixels: Pixels) -> Tensor | int:
     if pixels == "all":
         return error.numel()
     return valid.sum().clamp_min(1) * error.shape[-1]
-
-
-def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"Losses: {name} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def _require_pixels(who: str, image: Tensor) -> None:

@@ -45,6 +45,16 @@ def require_fields(who: str, given: Any) -> None:
     require_types(who, get_type_hints(type(given)), values)
 
 
+def require_choice(who: str, name: str, value: object, choices: Iterable[str]) -> None:
+    """Refuse a value that is none of the choices.
+
+    Raises:
+        ValueError: Names the value, the choices and what it is.
+    """
+    if value not in (known := tuple(choices)):
+        raise ValueError(f"{who}: {name} must be one of {', '.join(known)}, got {value!r}")
+
+
 def require_range(
     who: str, least: int | float, most: int | float, **values: int | float | None
 ) -> None:

@@ -9,13 +9,13 @@ import torch
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
+from vlgs.data.sampler import PairSampler, nearest_views
 from vlgs.features.extractor import MaskFeatures
 from vlgs.fields.splat import SplatModel
 from vlgs.geometry import camera_center
 from vlgs.identity import run_id
 from vlgs.module.augment import Offline
 from vlgs.module.build import Parts, build_module
-from vlgs.module.sampler import PairSampler, nearest_views
 from vlgs.module.separate import without_language
 from vlgs.types import Scene
 

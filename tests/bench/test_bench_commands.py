@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,16 @@ def test_bad_input_is_one_line_and_status_1(tmp_path: Path, capsys: pytest.Captu
     assert "must be a run folder with a checkpoint" in capsys.readouterr().err
     assert main(["train", "--recipes", "soup", "--out", str(tmp_path)]) == 1
     assert "recipe must be one of default" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("former", ["stress", "fuzz"])
+def test_a_former_subcommand_says_where_it_went(former: str, capsys: pytest.CaptureFixture[str]):
+    assert main([former, "--quick"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    module = re.search(r"python -m (tests\.\w+)", said)
+    assert module is not None
+    assert find_spec(f"{module[1]}.__main__")
 
 
 def test_a_header_repeats_the_command_without_the_folders_of_this_machine(

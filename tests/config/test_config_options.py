@@ -59,7 +59,7 @@ def test_the_command_line_of_the_design_composes():
 def test_paper_trainer_is_the_papers():
     config = composed("trainer=paper")
     assert config.trainer.iterations == 15_000
-    assert config.loss.blend_weight == 1.2
+    assert config.loss.blended_view.weight == 1.2
     rates = config.trainer.learning_rates
     # the paper's Table 7
     assert (rates.means, rates.log_scales, rates.quats, rates.sh0) == (1.6e-4, 5e-3, 1e-3, 5e-3)

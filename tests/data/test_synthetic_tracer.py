@@ -8,6 +8,8 @@ from vlgs.data.synthetic import layouts, tracer
 from vlgs.data.synthetic.cameras import camera_at, moments
 from vlgs.data.synthetic.patterns import Plain
 from vlgs.data.synthetic.photographs import photograph, pixel_rays
+from vlgs.data.synthetic.room import LAMP
+from vlgs.data.synthetic.scene_file import find_scene
 from vlgs.data.synthetic.shapes import Box, sphere
 from vlgs.data.synthetic.things import Material, Part, Thing
 from vlgs.data.synthetic.tracer import PANE, trace
@@ -15,7 +17,9 @@ from vlgs.data.synthetic.world import NOTHING, Hits, World
 
 
 def room(*things: Thing) -> World:
-    return World((*things, *layouts.build("glassware", "easy", np.random.default_rng(0))[-3:]))
+    return World(
+        (*things, *layouts.build(find_scene("glassware"), "easy", np.random.default_rng(0))[-3:])
+    )
 
 
 def ball(material: Material, x: float, y: float = 0.0) -> Thing:
@@ -29,7 +33,7 @@ def look(world: World, origin, direction) -> tracer.Traced:
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return World(layouts.build("patchwork", "hard", np.random.default_rng(1)))
+    return World(layouts.build(find_scene("patchwork"), "hard", np.random.default_rng(1)))
 
 
 def test_culling_misses_no_hit(world):
@@ -50,7 +54,7 @@ def test_culling_misses_no_hit(world):
 
 
 def test_ray_through_the_centre_of_a_thing_sees_that_thing():
-    things = layouts.build("lookalikes", "easy", np.random.default_rng(0))
+    things = layouts.build(find_scene("lookalikes"), "easy", np.random.default_rng(0))
     world = World(things)
     apple = next(i for i, thing in enumerate(things) if thing.name == "red apple")
     center = np.array(things[apple].parts[0].center)
@@ -112,7 +116,7 @@ def test_table_is_darker_beside_a_ball_on_the_far_side_of_the_lamp():
     white = Material(Plain((1.0, 1.0, 1.0), grain=0.0))
     world = room(Thing("ball", (Part(sphere(0.1), white, (0.0, 0.0, 0.1)),)))
     shade = next(iter(world.shades.values()))
-    lamp = np.array(layouts.LAMP[:2])
+    lamp = np.array(LAMP[:2])
     away = -lamp / np.linalg.norm(lamp)
     points = np.stack([[*(0.08 * away), 0.0], [*(-0.4 * away), 0.0]], axis=1)
     np.testing.assert_allclose(shade.at(points), [0.0, 1.0], atol=0.02)

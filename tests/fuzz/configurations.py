@@ -153,7 +153,7 @@ WRONG = (
     ("augment=offline_sam features.weights=nowhere", "nowhere"),
     ("augment=offline augment.views=0", "views"),
     ("augment=offline augment.pairs=some", "pairs"),
-    ("loss.rgb_loss=huber", "rgb_loss"),
+    ("loss.photometric.error=huber", "error"),
     ("raster.alpha_max=1", "alpha_max"),
     ("raster.stop=never", "stop"),
     ("query=lerf", "lerf_relevancy"),

@@ -18,6 +18,7 @@ SAMPLES = {
     "places": ("--every", "16"),
     "text": ("--every", "7", "--count", "0"),
     "results": ("--every", "13", "--count", "0"),
+    "scene_files": ("--count", "30"),
 }
 
 

@@ -81,7 +81,7 @@ def _tables(name: str, folder: Path) -> None:
 
 def _html(name: str, folder: Path) -> None:
     filled = _filled(name)
-    write_report(folder, [filled], tidy(filled.runs), folder)
+    write_report(folder, [filled], filled.runs, folder)
     page = Page()
     page.feed((folder / "index.html").read_text())
     assert page.tags <= PAGE_TAGS, page.tags - PAGE_TAGS
@@ -161,7 +161,7 @@ def _filled(name: str) -> Filled:
     run = Line("h", "r", "d", name, name, 0, name, 2, name, name, "miou", "", "", 0.5)
     cells = {Place(0, name, "miou"): cell}
     said = (f"data: {name}", f"machine: {name}")
-    return Filled(table, BENCHMARK, (name,), {}, {0: "r"}, False, cells, (), (run,), said)
+    return Filled(table, BENCHMARK, (name,), {}, {0: "r"}, False, cells, (), tidy([run]), said)
 
 
 def _obeyed(text: str) -> set[str]:

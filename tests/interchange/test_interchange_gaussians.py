@@ -37,7 +37,7 @@ def random_params(
         "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "sh0": (n, 3), "shN": (n, coefficients, 3),
         "opacity_logits": (n,), "indicator_logits": (n,), "features": (n, width),
     }  # fmt: skip
-    return {name: torch.randn(shapes[name], generator=generator) for name in PARAMETERS}
+    return {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
 
 
 def imported(params: dict[str, Tensor], language: bool = True) -> Imported:

@@ -4,13 +4,11 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import torch
-from hydra.utils import instantiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
 from torch import Tensor
 
-from vlgs.losses import Losses, l1_dssim, masked_cosine, masked_l1, masked_mse, ssim
+from vlgs.losses import l1_dssim, masked_cosine, masked_l1, masked_mse, ssim
 
 CONF = Path(__file__).parents[2] / "conf" / "loss"
 PIXELWISE = [masked_mse, masked_l1, masked_cosine]
@@ -105,52 +103,9 @@ def test_cosine_of_vanishing_vectors_has_a_finite_gradient(scale: float, target:
     assert (render.grad < 0).any() == (target > 0)  # codes that start at zero still learn
 
 
-def test_weights_of_the_overall_loss():
-    color, image = torch.full((2, 2, 3), 0.5), torch.zeros(2, 2, 3)
-    feature, target = torch.full((2, 2, 1), 3.0), torch.ones(2, 2, 1)
-    valid = torch.tensor([[True, False], [False, False]])
-    losses = Losses()
-    assert losses.color_loss(color, image).item() == 0.25
-    assert losses.language_loss(feature, target, valid).item() == 4
-    assert losses.blended_loss(feature, target, valid, 0.5).item() == pytest.approx(1.2 * 0.5 * 4)
-    everywhere = Losses(lang_pixels="all", blend_weight=2.0)
-    assert everywhere.blended_loss(feature, target, valid, 1.0).item() == 2.0
-
-
-def test_options_choose_their_function():
-    render, target = (x.detach().float() for x in maps())
-    language = {
-        masked_mse: Losses(lang_loss="mse"),
-        masked_l1: Losses(lang_loss="l1"),
-        masked_cosine: Losses(lang_loss="cos"),
-    }
-    color = {masked_mse: Losses(rgb_loss="mse"), l1_dssim: Losses(rgb_loss="l1_dssim")}
-    for valid in (None, VALID):
-        for loss, losses in language.items():
-            got = losses.language_loss(render, target, valid)
-            assert torch.equal(got, loss(render, target, valid))
-        for loss, losses in color.items():
-            assert torch.equal(
-                losses.color_loss(render, target, valid), loss(render, target, valid)
-            )
-
-
-def test_default_option_is_the_default_of_the_class():
-    assert instantiate(OmegaConf.load(CONF / "default.yaml")) == Losses()
-
-
 def test_bad_input_is_refused(monkeypatch: pytest.MonkeyPatch):
     # The run-time types would speak first.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    with pytest.raises(ValueError, match="rgb_loss must be one of mse, l1_dssim, got 'l2'"):
-        Losses(rgb_loss="l2")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="lang_loss must be one of mse, l1, cos, got 'l2'"):
-        Losses(lang_loss="l2")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="lang_pixels must be one of valid, all, got 'some'"):
-        Losses(lang_pixels="some")  # pyright: ignore[reportArgumentType]
-    for weight in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="blend_weight must be finite and >= 0, got"):
-            Losses(blend_weight=weight)
     for loss in (*PIXELWISE, l1_dssim, ssim):
         with pytest.raises(ValueError, match=r"target must be \(2, 3, 1\), got \(3, 2, 1\)"):
             loss(torch.zeros(2, 3, 1), torch.zeros(3, 2, 1))

@@ -2,9 +2,9 @@ import pytest
 import torch
 
 from vlgs.blend import BetaBlend, blend_camera
+from vlgs.data.sampler import PairSampler
 from vlgs.geometry import pose_matrix, quat_to_rotmat
-from vlgs.module.blended import AHEAD, CamerasBetween
-from vlgs.module.sampler import PairSampler
+from vlgs.objectives.between import AHEAD, CamerasBetween
 from vlgs.types import Camera
 
 

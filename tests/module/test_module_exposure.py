@@ -53,9 +53,9 @@ def test_maps_are_the_identity_on_average():
 
 def test_dark_photographs_have_dark_maps(tmp_path: Path):
     module = trained(tmp_path, "trainer.iterations=150")
-    assert module.exposure is not None
+    assert module.step.exposure is not None
     grey = torch.full((1, 1, 3), 0.5)
-    shown: Tensor = torch.stack([module.exposure(i, grey).mean() for i in range(6)]).detach()
+    shown: Tensor = torch.stack([module.step.exposure(i, grey).mean() for i in range(6)]).detach()
     dark, bright = shown[0::2], shown[1::2]
     assert (dark < 0.9 * bright.min()).all()
     assert abs(float(dark.mean() / bright.mean()) - 0.6) < 0.15
@@ -69,8 +69,8 @@ def test_a_resumed_run_has_the_same_maps(tmp_path: Path):
     half.settings = replace(half.settings, iterations=6)
     fit(half, RunFolder(tmp_path / "halves"), FitOptions(meta={}, progress=False))
     resumed = trained(tmp_path / "halves", *budget)
-    assert whole.exposure is not None
-    assert resumed.exposure is not None
-    assert whole.exposure.maps.abs().sum() > 0
-    assert torch.equal(whole.exposure.maps, resumed.exposure.maps)
+    assert whole.step.exposure is not None
+    assert resumed.step.exposure is not None
+    assert whole.step.exposure.maps.abs().sum() > 0
+    assert torch.equal(whole.step.exposure.maps, resumed.step.exposure.maps)
     assert torch.equal(whole.model.splats["means"], resumed.model.splats["means"])

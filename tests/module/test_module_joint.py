@@ -16,7 +16,7 @@ from vlgs.gaussians import densify, read_ply, write_ply
 from vlgs.gaussians.densify import DensifyState
 from vlgs.gaussians.logistic import logit
 from vlgs.gaussians.parameters import at_levels
-from vlgs.module.build import Parts, build_module
+from vlgs.module.build import Parts, bind, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.joint import join_levels
 from vlgs.module.lightning import VLGSModule
@@ -112,7 +112,7 @@ def test_shapes(scenes: list[Scene], indicator: str, shape: tuple[int, ...]):
     assert module.model.levels == 3
     assert module.model.splats["features"].shape == (n, 9)
     assert module.model.splats["indicator_logits"].shape == (n, *shape[1:])
-    target = module.target(0)
+    target = module.views[0]
     assert target.codes is not None
     assert target.valid is not None
     assert target.codes.shape == (36, 48 * 3, 3)
@@ -152,10 +152,12 @@ def test_three_equal_levels_are_one_model(scenes: list[Scene], indicator: str):
     three = stirred(module_of(join_levels([scenes[2]] * 3), *options, f"indicator={indicator}"))
     # The codecs were fitted to one set of vectors, listed once and thrice.
     three.model.codec.load_state_dict(one.model.codec.state_dict())  # type: ignore[operator]
-    three.mask_codes = three._encode_masks()
+    given, skip = three.step.setup, three.settings.skip
+    setup = bind(given.objectives, given.views.scene, three.model, given.blend, skip, 0)
+    three.step.setup = setup
     for module in (one, three):
         module.training_step(0, 0)
-    assert one.report.blend_weight > 0
+    assert one.report.log["blend_weight"] > 0
     # float32 sums over three times as many terms: 2e-7 measured.
     assert three.report.loss == pytest.approx(one.report.loss, rel=1e-5)
     for name, parameter in one.model.splats.items():
@@ -230,7 +232,7 @@ def test_training_learns_every_level(scenes: list[Scene], tmp_path: Path):
     module = module_of(join_levels(scenes), "trainer.iterations=120", "indicator=per_level")
 
     def errors() -> list[float]:
-        target = module.target(0)
+        target = module.views[0]
         assert target.codes is not None
         assert target.valid is not None
         with torch.no_grad():
@@ -264,7 +266,7 @@ def test_a_level_that_needs_a_gaussian_keeps_it(scenes: list[Scene]):
     count = module.model.count
     state = DensifyState.zeros(count)
     report = densify(
-        splats, module.optimizer, state, module.gaussians_config, module.extent, 0, 100
+        splats, module.optimizer, state, module.densifying.config, module.densifying.extent, 0, 100
     )
     assert report.count == count - 100
     assert splats["indicator_logits"].shape == (count - 100, 3)

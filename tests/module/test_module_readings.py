@@ -36,7 +36,7 @@ def with_harmonics(module: VLGSModule, size: float) -> VLGSModule:
 def test_rgb_has_no_harmonics(tiny_scene: Scene):
     module = module_of(tiny_scene, "gaussians.color=rgb")
     assert module.model.splats["shN"].shape[1:] == (0, 3)
-    module._set_schedule(10_000)
+    module.set_schedule(10_000)
     assert module.model.sh_degree == 0
 
 
@@ -76,7 +76,7 @@ def test_lifted_codes_are_the_weighted_means_of_what_is_seen(tiny_scene: Scene):
     above = torch.zeros(n, 3)
     below = torch.zeros(n)
     for index, view in enumerate(few.train):
-        target = module.target(index)
+        target = module.views[index]
         assert target.codes is not None
         assert target.valid is not None
         blended = model.render_values(view.camera, torch.eye(n), weight)[target.valid].detach()
@@ -118,10 +118,10 @@ def test_what_is_not_blended_stays_that_of_the_nearer_view(tiny_scene: Scene, k:
 
 def test_pairs_of_neighbours(tiny_scene: Scene):
     module = module_of(tiny_scene, "blend.pairs=neighbours", "blend.neighbours=1")
-    near = module.sampler.near
+    near = module.views.sampler.near
     assert near is not None
     for step in range(12):
-        first, second = module.sampler.pair(step)
+        first, second = module.views.sampler.pair(step)
         assert near[first] == (second,)
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vlgs.module.sampler import PairSampler
+from vlgs.data.sampler import PairSampler
 
 
 @given(st.integers(2, 30), st.integers(0, 2**31), st.integers(0, 10_000))

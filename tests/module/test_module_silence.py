@@ -45,7 +45,7 @@ def share_by_rendering(module: VLGSModule) -> Tensor:
     """`outside_masks` of one level, from pictures in which every Gaussian has a channel of its own."""
     model, weight = module.model, module.model.gaussians().indicators.detach()
     total = torch.zeros(model.count, 2)
-    for view in module.scene.train:
+    for view in module.views.scene.train:
         assert view.read_masks is not None
         with torch.no_grad():
             own = model.render_values(view.camera, torch.eye(model.count), weight)
@@ -74,7 +74,7 @@ def test_above_the_share_and_nowhere_else_codes_are_zero():
 
 
 def test_pixels_that_no_photograph_covers_do_not_count():
-    scene = module_of(None).scene
+    scene = module_of(None).views.scene
     assert scene.train[0].read_masks is not None
     shape = scene.train[0].read_masks().shape[:2]
     nothing = torch.zeros(shape, dtype=torch.bool)
@@ -84,7 +84,7 @@ def test_pixels_that_no_photograph_covers_do_not_count():
 
 @pytest.mark.parametrize("indicator", ["learned", "per_level"])
 def test_every_level_is_asked_by_itself(indicator: str):
-    scenes = [module_of(None, f"data.level={level}").scene for level in (1, 2, 3)]
+    scenes = [module_of(None, f"data.level={level}").views.scene for level in (1, 2, 3)]
     blank = tuple(
         replace(view, read_masks=lambda masks=view.read_masks: torch.full_like(masks(), -1))
         for view in scenes[1].train

@@ -14,13 +14,14 @@ from vlgs.blend import BetaBlend, blend_camera
 from vlgs.config import instantiate
 from vlgs.gaussians import write_ply
 from vlgs.geometry import camera_center
-from vlgs.module.blended import plan_blend
 from vlgs.module.build import Parts, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
-from vlgs.module.skips import WORK, SkipCount
 from vlgs.module.state import capture, restore
+from vlgs.objectives import Language
+from vlgs.objectives.between import plan_blend
 from vlgs.runs import RunFolder
+from vlgs.skip_count import WORK, SkipCount
 from vlgs.skips import SKIPS
 from vlgs.types import Camera, Scene
 
@@ -49,7 +50,7 @@ def first_step(module: VLGSModule) -> tuple[float, dict[str, Tensor]]:
         module.model.splats["features"].copy_(
             torch.randn(module.model.splats["features"].shape, generator=rng)
         )
-    module._set_schedule(0)
+    module.set_schedule(0)
     original = module.optimizer.step
     module.optimizer.step = lambda *_: None  # type: ignore[method-assign]
     module.training_step(0, 0)
@@ -94,13 +95,15 @@ def test_skipping_a_light_blended_view_changes_the_loss_by_its_bound(tiny_scene:
     skipping = module_of(tiny_scene, f"trainer.skip.blend_weight={limit}")
     rendering = module_of(tiny_scene)
     losses = []
-    original = rendering.losses.language_loss
+    language = rendering.step.setup.objectives["language"]
+    assert isinstance(language, Language)
+    original = language.of
 
     def recorded(*arguments: Tensor) -> Tensor:
         losses.append(original(*arguments))
         return losses[-1]
 
-    object.__setattr__(rendering.losses, "language_loss", recorded)
+    language.of = recorded  # type: ignore[method-assign]
     difference = first_step(rendering)[0] - first_step(skipping)[0]
     mse = float(losses[-1].detach())  # the blended view's comes last
     assert 0 < difference <= limit * mse * (1 + 1e-5)

@@ -16,7 +16,7 @@ def test_targets_of_all_views_are_kept_or_those_of_an_iteration(
     tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, fits: bool
 ):
     size = 48 * 36 * (3 * 4 + 3 * 4 + 1)
-    monkeypatch.setattr("vlgs.module.lightning.TARGET_BYTES", (6 if fits else 5) * size)
+    monkeypatch.setattr("vlgs.objectives.targets.TARGET_BYTES", (6 if fits else 5) * size)
     reads: Counter[str] = Counter()
 
     def counted(name: str, read):
@@ -28,7 +28,7 @@ def test_targets_of_all_views_are_kept_or_those_of_an_iteration(
 
     views = [replace(v, read_image=counted(v.name, v.read_image)) for v in tiny_scene.train]
     module = module_of(replace(tiny_scene, train=tuple(views)))
-    assert module.target_cache.limit == (6 if fits else 2) * size
+    assert module.views.cache.limit == (6 if fits else 2) * size
     steps = 12  # two epochs
     for step in range(steps):
         module.training_step(step, 0)

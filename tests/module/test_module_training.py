@@ -13,6 +13,7 @@ from vlgs.module.build import Parts, build_module
 from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
+from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.runs import RunFolder
 from vlgs.types import Scene, View
 
@@ -45,7 +46,10 @@ def state_of(module: VLGSModule) -> dict[str, Tensor]:
         for index, parameter in enumerate(group["params"]):
             for key, value in module.optimizer.state[parameter].items():
                 state[f"adam.{group['name']}.{index}.{key}"] = value
-    state["grad_sum"], state["count"] = module.densify_state.grad_sum, module.densify_state.count
+    state["grad_sum"], state["count"] = (
+        module.densifying.state.grad_sum,
+        module.densifying.state.count,
+    )
     return state
 
 
@@ -116,18 +120,18 @@ def test_training_lowers_the_loss(tiny_scene: Scene, tmp_path: Path):
 
 
 def test_a_non_finite_image_stops_with_a_name_and_keeps_the_checkpoint(
-    tiny_scene: Scene, tmp_path: Path
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     module = module_of(tiny_scene, "trainer.checkpoint_every=4")
-    original = module.target
+    original = TrainingViews.__getitem__
 
-    def poisoned(index: int):
-        target = original(index)
+    def poisoned(views: TrainingViews, index: int) -> Target:
+        target = original(views, index)
         if module.next_step >= 9:
             target.image[3, 2, 1] = float("nan")
         return target
 
-    module.target = poisoned  # type: ignore[method-assign]
+    monkeypatch.setattr(TrainingViews, "__getitem__", poisoned)
     with pytest.raises(
         FloatingPointError, match=r"loss must be finite, got nan in step 9 with views \w+ and \w+"
     ):
@@ -233,7 +237,7 @@ def test_one_view_is_enough(tiny_scene: Scene, tmp_path: Path):
     assert train(module_of(replace(tiny_scene, train=alone)), tmp_path).next_step == 24
 
 
-@pytest.mark.parametrize("blend", ["blend=none", "loss.blend_weight=0.0"])
+@pytest.mark.parametrize("blend", ["blend=none", "loss.blended_view.weight=0.0"])
 def test_a_blended_view_without_weight_is_not_rendered(
     tiny_scene: Scene, tmp_path: Path, blend: str
 ):
@@ -243,9 +247,9 @@ def test_a_blended_view_without_weight_is_not_rendered(
 
 def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
     module = module_of(tiny_scene)
-    assert module.similarity(1, 4) == module.similarity(4, 1)
-    assert len(module.skips.similarities) == 1
-    assert 0 <= module.similarity(1, 4) <= 1
+    assert module.views.similarity(1, 4) == module.views.similarity(4, 1)
+    assert len(module.views.similarities) == 1
+    assert 0 <= module.views.similarity(1, 4) <= 1
 
 
 @pytest.mark.parametrize(
@@ -254,7 +258,7 @@ def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
         ["fusion=none", "indicator=opacity", "blend=none"],
         ["fusion=mlp", "indicator=fixed", "blend=fixed"],
         ["fusion=cross", "blend=gaussian", "blend.convention=paper"],
-        ["blend=uniform", "blend.rotation=false", "loss.rgb_loss=l1_dssim"],
+        ["blend=uniform", "blend.rotation=false", "loss.photometric.error=l1_dssim"],
         ["gaussians.densify_on=rgb", "gaussians.prune_on=opacity", "gaussians.sh_degree=0"],
         ["gaussians.color=rgb", "gaussians.prune_on=indicator", "blend.mask=or"],
         ["gaussians.color=evaluated", "blend.pairs=neighbours", "trainer.means_steps=30000"],

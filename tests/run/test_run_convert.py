@@ -31,7 +31,7 @@ def some_gaussians(n: int = 40, width: int = 3) -> dict[str, torch.Tensor]:
         "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "sh0": (n, 3), "shN": (n, 15, 3),
         "opacity_logits": (n,), "indicator_logits": (n,), "features": (n, width),
     }  # fmt: skip
-    params = {name: torch.randn(shapes[name], generator=generator) for name in PARAMETERS}
+    params = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
     return params | {"log_scales": params["log_scales"] * 0.1 - 2}
 
 

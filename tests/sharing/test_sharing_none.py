@@ -85,7 +85,7 @@ def test_gaussians_of_language_live_by_their_indicator(tiny_scene: Scene, tmp_pa
         module.model.splats["indicator_logits"][5] = -9.0
     n = module.model.count
     state = DensifyState.zeros(n)
-    config = module.gaussians_config
+    config = module.densifying.config
     report = densify(module.model.splats, module.optimizer, state, config, 1.0, 0, 8)
     assert report.pruned == 1
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from vlgs.bench.stress.splats import SMOOTH, make_splats
+from tests.stress.splats import SMOOTH, make_splats
 from vlgs.blend import FixedBlend, blend_targets
 from vlgs.blend.pose import slerp
 from vlgs.codec.autoencoder import Autoencoder
@@ -27,12 +27,13 @@ from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
 from vlgs.fusion.mlp import MLP
+from vlgs.gaussians.attributes import STANDARD
+from vlgs.gaussians.logistic import logistic
 from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.indicator import ColourOpacity, Learned, PerLevel
 from vlgs.losses import (
-    Losses,
     l1_dssim,
     masked_cosine,
     masked_l1,
@@ -40,6 +41,7 @@ from vlgs.losses import (
     ssim,
     ssim_map,
 )
+from vlgs.objectives import Language
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
@@ -50,13 +52,22 @@ from vlgs.ops.view_color import view_color
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
-AREAS = ("ops", "fields", "losses", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
-"""What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up."""
+AREAS = ("ops", "fields", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+"""What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {
     "vlgs.fusion.Fusion.__call__": "protocol",
     "vlgs.codec.Codec.encode": "protocol",
     "vlgs.codec.Codec.decode": "protocol",
+    "vlgs.gaussians.parameters.at_levels": "before training",
+    "vlgs.gaussians.parameters.complete": "before training",
+    "vlgs.gaussians.parameters.conform": "before training",
+    "vlgs.objectives.objective.Objective.__call__": "protocol",
+    **{f"vlgs.objectives.{name}": "adds up errors that are checked" for name in (
+        "photometric.Photometric.__call__", "language.Language.__call__",
+        "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss",
+    )},
+    "vlgs.objectives.targets.covered": "a mask",
     "vlgs.query.Query.relevancy": "protocol",
     "vlgs.query.Query.__call__": "protocol",
     "vlgs.query.text.TextEncoder.encode": "protocol",
@@ -71,9 +82,6 @@ NO_GRADIENT = {
     "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
     "vlgs.gaussians.ply.read_ply": "from a file",
     "vlgs.gaussians.ply.parse_ply": "from a file",
-    "vlgs.gaussians.parameters.complete": "fills a file's gaps",
-    "vlgs.gaussians.parameters.with_language_shape": "placed once",
-    "vlgs.gaussians.parameters.with_level_indicators": "placed once",
     "vlgs.gaussians.sound.broken_rows": "a mask",
     "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
     **{f"vlgs.fields.{name}": "protocol" for name in (
@@ -268,11 +276,11 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.losses.l1_dssim by both images, without a mask": lambda: (
         l1_dssim, [draw(*SIZE), 2 + draw(*SIZE, seed=1)]
     ),
-    "vlgs.losses.Losses.color_loss": lambda: (
-        lambda a: Losses(rgb_loss="l1_dssim").color_loss(a, 2 + draw(3, 4, 3, seed=9)), [draw(3, 4, 3)]
+    "vlgs.objectives.language.Language.of": lambda: both(Language("cos").of, VALID),
+    "vlgs.gaussians.logistic.logistic": lambda: (logistic, [draw(5, low=-20, high=20)]),
+    "vlgs.gaussians.attributes.Attribute.activate": lambda: (
+        STANDARD["log_scales"].activate, [draw(3, 3)]
     ),
-    "vlgs.losses.Losses.language_loss": lambda: both(Losses(lang_loss="cos").language_loss, VALID),
-    "vlgs.losses.Losses.blended_loss": lambda: both(Losses().blended_loss, VALID, 0.7),
     "vlgs.geometry.quat_to_rotmat": lambda: (quat_to_rotmat, [draw(4, 4)]),
     "vlgs.geometry.rotmat_to_quat": lambda: (rotmat_to_quat, [rotation]),
     "vlgs.geometry.camera_center": lambda: (camera_center, [draw(2, 4, 4)]),

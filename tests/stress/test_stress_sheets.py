@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from vlgs.bench import fuzz_sheet
-from vlgs.bench.fuzz import FuzzReport
-from vlgs.bench.fuzz_sheet import CHUNK, run_fuzz
+from tests.fuzz_kernel import FuzzReport
+from tests.fuzz_kernel import sheet as fuzz_sheet
+from tests.fuzz_kernel.sheet import CHUNK, run_fuzz
+from tests.stress import sheet
+from tests.stress.case import Case, Verdict
+from tests.stress.sheet import run_cases
 from vlgs.bench.sheet import read_sheet
-from vlgs.bench.stress import sheet
-from vlgs.bench.stress.case import Case, Verdict
-from vlgs.bench.stress.sheet import run_cases
 
 
 @pytest.fixture
@@ -18,8 +18,8 @@ def code(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The commit that the modules believe to be at."""
     now = ["a" * 40]
     for module in (fuzz_sheet, sheet):
-        monkeypatch.setattr(module, "commit", lambda: now[0])
-        monkeypatch.setattr(module, "same_code", lambda one, other: one == other)
+        monkeypatch.setattr(module, "commit_with", lambda folder: now[0])
+        monkeypatch.setattr(module, "same_code_with", lambda folder, one, other: one == other)
     return now
 
 

@@ -15,7 +15,7 @@ from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.fill import Cell, Filled, Place, fill
-from vlgs.tables.frame import by_row, read_metrics, require_one_meaning, tidy, to_lines
+from vlgs.tables.frame import read_metrics, require_one_meaning, tidy, to_lines
 from vlgs.tables.grid import arrange
 from vlgs.tables.html import write_report
 from vlgs.tables.latex import to_latex
@@ -52,7 +52,7 @@ def table(tmp_path: Path) -> Table:
 
 
 def filled_of(table: Table, results: Path, benchmark: Benchmark = BENCHMARK) -> Filled:
-    return fill(table, benchmark, Composer(benchmark), by_row(to_lines(read_metrics(results))))
+    return fill(table, benchmark, Composer(benchmark), tidy(to_lines(read_metrics(results))))
 
 
 def cell(filled: Filled, row: int, column: str, metric: str = "miou") -> Cell:
@@ -153,7 +153,7 @@ def test_every_table_of_the_registry_is_well_formed_without_a_run(label: str):
         for row in table.rows  # what they override is test_tables_registry's
     )
     table = Table(**{**vars(table), "rows": rows})
-    filled = fill(table, BENCHMARK, Composer(BENCHMARK), {})
+    filled = fill(table, BENCHMARK, Composer(BENCHMARK), tidy([]))
     balanced(to_latex(filled))
     assert filled.cells
     assert all(pd.isna(found.mean) for found in filled.cells.values())

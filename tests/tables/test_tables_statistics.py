@@ -14,7 +14,7 @@ from tables_fakes import fake_runs
 
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.fill import Filled, fill
-from vlgs.tables.frame import by_row, read_metrics, to_lines
+from vlgs.tables.frame import read_metrics, tidy, to_lines
 from vlgs.tables.registry import Row, load_table
 from vlgs.tables.statistics import (
     bootstrap_interval,
@@ -136,7 +136,7 @@ def filled_of(
     path.write_text(text)
     table = load_table(path)
     fake_runs(tmp_path, [table], benchmark, value, skip=skip or [])
-    return fill(table, benchmark, Composer(benchmark), by_row(to_lines(read_metrics(tmp_path))))
+    return fill(table, benchmark, Composer(benchmark), tidy(to_lines(read_metrics(tmp_path))))
 
 
 def test_rows_are_judged_in_pairs(tmp_path: Path):

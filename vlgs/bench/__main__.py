@@ -224,51 +224,6 @@ def protocols(parser: ArgumentParser) -> Runner:
     return run
 
 
-def stress(parser: ArgumentParser) -> Runner:
-    """Hostile input, case by case: criterion, measured, passed; 1 if one failed. What passed on this code is not run again."""
-    parser.add_argument(
-        "--only", nargs="+", default=[], metavar="CASE", help="names or parts: run, not recorded"
-    )
-
-    def run(args: Namespace) -> int:
-        from rich.console import Console
-
-        from vlgs.bench.stress import CASES
-        from vlgs.bench.stress.sheet import FAILED, run_cases, show_table
-
-        cases = [c for c in CASES if not args.only or any(part in c.name for part in args.only)]
-        if not cases:
-            raise ValueError(f"stress: --only must match a case, got {' '.join(args.only)}")
-        path = None if args.only else args.out / "stress.csv"
-        rows = run_cases(cases, not args.quick, path)
-        console = Console()
-        console.print(show_table(rows), width=max(console.width, 140))
-        return int(any(row.outcome == FAILED for row in rows))
-
-    return run
-
-
-def fuzz(parser: ArgumentParser) -> Runner:
-    """Random hostile scenes through the kernels, recorded in fuzz.csv; 1 if one was answered wrongly."""
-    parser.add_argument("--scenes", type=int, default=10_000, help="in all, with those recorded")
-    parser.add_argument("--first", type=int, help="first seed; default: 0, and record")
-
-    def run(args: Namespace) -> int:
-        from vlgs.bench.fuzz import fuzz as run_seeds
-        from vlgs.bench.fuzz_sheet import CLEAN, run_fuzz
-        from vlgs.ops.machine import instruction_set
-
-        count = 20 if args.quick else args.scenes
-        if args.first is not None:
-            report = run_seeds(range(args.first, args.first + count))
-            print(report)
-            return int(bool(report.failures))
-        row = run_fuzz(instruction_set(), "none", count, run_seeds, args.out / "fuzz.csv")
-        return int(row.outcome != CLEAN)
-
-    return run
-
-
 SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     kernel,
     error,
@@ -280,10 +235,11 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     iteration,
     reading,
     protocols,
-    stress,
-    fuzz,
 )
 """Name, help and options of a subcommand are those of its function; `all` runs them in this order."""
+
+MOVED = {"stress": "tests.stress", "fuzz": "tests.fuzz_kernel"}
+"""Former subcommands, which need a checkout, and the modules to run instead."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -304,7 +260,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         own.set_defaults(runner=subcommand(own))
     everything = commands.add_parser("all", help="All of these.", parents=[common])
     everything.set_defaults(runner=_run_all)
-    args = parser.parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given and given[0] in MOVED:
+        moved = f"it is python -m {MOVED[given[0]]} in a checkout"
+        print(f"error: bench: subcommand must measure, got {given[0]}; {moved}", file=sys.stderr)
+        return 1
+    args = parser.parse_args(given)
     args.out = args.out or Path("results/bench/quick" if args.quick else "results/bench")
     try:
         return args.runner(args)

@@ -3,11 +3,11 @@
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
+from inspect import getattr_static
 from statistics import fmean
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -16,6 +16,7 @@ from rich.table import Table
 from vlgs.config import CONF, instantiate
 from vlgs.module.build import Parts, build_module
 from vlgs.module.lightning import VLGSModule
+from vlgs.objectives import BlendedView
 from vlgs.ops import attention, blend, project, view_color
 
 KERNELS = ("project", "blend", "fusion", "Adam")
@@ -83,11 +84,11 @@ def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
     with ExitStack() as patches:
         module = _module(size)
         for index in range(size.views):
-            module.target(index)  # as after the first epoch
+            module.views[index]  # as after the first epoch
         for owner, name, part in _timed(module):
             call = watch.around(part, getattr(owner, name))
-            made = staticmethod(call) if isinstance(owner, type) else call
-            patches.enter_context(patch.object(owner, name, made))
+            static = isinstance(getattr_static(owner, name), staticmethod)
+            patches.enter_context(_replaced(owner, name, staticmethod(call) if static else call))
         first = size.sh_degree * module.settings.sh_every
         statistics = watch.around("densification statistics", _gather_statistics)
         step = watch.around("step, what is left", module.training_step)
@@ -113,24 +114,39 @@ def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
         yield function, "backward", part
     yield module.optimizer, "step", "Adam"
     yield module.optimizer, "zero_grad", "zero_grad"
-    yield module, "target", "targets"
-    yield module, "similarity", "similarity of the views"
-    yield module, "_backward", "backward of the rest"
+    yield type(module.views), "__getitem__", "targets"
+    yield module.views, "similarity", "similarity of the views"
+    yield module.step, "backward", "backward of the rest"
     yield module, "_refuse_non_finite", "finite check"
-    yield module, "_color_loss", "losses, forward"
-    yield module, "_language_loss", "losses, forward"
-    yield module, "_color_mse", "PSNR of the step"
-    yield module, "_plan_blend", "blended view, forward"
-    yield module, "_blended_loss", "blended view, forward"
+    for objective in module.step.setup.objectives.values():
+        blended = isinstance(objective, BlendedView)
+        part = "blended view, forward" if blended else "losses, forward"
+        yield type(objective), "__call__", part
     yield module.model, "fuse", "activation, forward"
     yield module.model, "view_color", "spherical harmonics"
     yield module.model, "render", "render, what is left"
 
 
+@contextmanager
+def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Another attribute for a while; whether the owner has one of its own or that of its class is as before afterwards."""
+    own = name in vars(owner)
+    before = vars(owner).get(name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        if own:
+            setattr(owner, name, before)
+        else:
+            delattr(owner, name)
+
+
 def _gather_statistics(module: VLGSModule) -> None:
-    for gradient, render in zip(module.screen_gradients, module.report.renders, strict=True):
+    report = module.report
+    for gradient, render in zip(report.screen_gradients, report.renders, strict=True):
         height, width = render.alpha_color.shape if render.alpha_color is not None else (1, 1)
-        module.densify_state.accumulate(gradient, render.visible, width, height)
+        module.densifying.state.accumulate(gradient, render.visible, width, height)
 
 
 def share_of_rest(parts: dict[str, float]) -> float:

@@ -1,22 +1,19 @@
 """One training step with a switch of `vlgs.skips` on or off. It ends before Adam, so that it can be repeated from the same state."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import dataclass, fields, replace
 from time import perf_counter, process_time
 from typing import Any, NamedTuple
-from unittest.mock import patch
-
-from torch import Tensor
 
 from vlgs.bench.clock import Pass
 from vlgs.bench.outcome import Outcome
 from vlgs.fusion.none import NoFusion
-from vlgs.module.blended import BlendPlan
+from vlgs.module.build import bind
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.settings import SkipConfig
 from vlgs.module.state import capture, restore
+from vlgs.module.step import Forward
 from vlgs.skips import SKIPS, Skip
 
 FROZEN = ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits", "indicator_logits")
@@ -61,47 +58,40 @@ def turned(module: VLGSModule, switch: StepSwitch, on: bool) -> VLGSModule:
 
     ``frozen_weights`` is for language on finished geometry: on both sides everything else is frozen, and nothing fused.
     """
-    freeze, config = module.settings.freeze, module.gaussians_config
+    freeze, config = module.settings.freeze, module.densifying.config
     if switch.field == "frozen_weights":
         own = [name for name in module.model.splats if name.startswith("language_")]
         freeze = [*FROZEN, *own]
         config = replace(config, densify=replace(config.densify, stop=0))
     skip = replace(module.settings.skip, **switch.setting(on))
     settings = replace(module.settings, freeze=freeze, skip=skip)
-    made = VLGSModule(
-        deepcopy(module.model), module.scene, module.blend, module.losses, config, settings,
-        module.seed, module.color,
-    )  # fmt: skip
+    model, given = deepcopy(module.model), module.step.setup
+    objectives = {name: copy(objective) for name, objective in given.objectives.items()}
+    setup = bind(objectives, given.views.scene, model, given.blend, skip, module.seed)
+    setup.views.similarities = given.views.similarities  # constants of the scene
+    made = VLGSModule(model, setup, config, settings, module.seed)
     restore(made, capture(module, {}))
     if switch.field == "frozen_weights":
         made.model.fusion = NoFusion()
     made.skips.restore({})
-    made.skips.similarities = module.skips.similarities  # constants of the scene
     return made
 
 
 def run_step(module: VLGSModule, step: int) -> Pass:
     """One training step up to Adam, which does not follow: time forward, and backward until Adam would begin."""
-    marks: list[tuple[float, float]] = []
+    return _run(module, step)[0]
 
-    def mark() -> None:
-        marks.append((perf_counter(), process_time()))
 
-    def backward(*args: Any) -> Any:
-        mark()
-        return right(*args)
-
-    right, next_step = module._backward, module.next_step
-    with ExitStack() as patches:
-        patches.enter_context(patch.object(module, "_backward", backward))
-        patches.enter_context(patch.object(module.optimizer, "step", mark))
-        mark()
-        module.training_step(step, 0)
-    module.next_step = next_step
-    # Without a backward pass where nothing that is trained is in view.
-    start, middle, end = marks if len(marks) == 3 else (*marks, marks[-1])
+def _run(module: VLGSModule, step: int) -> tuple[Pass, Forward]:
+    start = perf_counter(), process_time()
+    module.set_schedule(step)
+    done = module.step.forward(step)
+    module.optimizer.zero_grad(set_to_none=True)
+    middle = perf_counter(), process_time()
+    module.step.backward(done)
+    end = perf_counter(), process_time()
     ways = ((start, middle), (middle, end))
-    return Pass(*(1e3 * (b - a) for way in ways for a, b in zip(*way, strict=True)))
+    return Pass(*(1e3 * (b - a) for way in ways for a, b in zip(*way, strict=True))), done
 
 
 def run_steps(module: VLGSModule, steps: Sequence[int]) -> Pass:
@@ -112,20 +102,13 @@ def run_steps(module: VLGSModule, steps: Sequence[int]) -> Pass:
 
 def measure_step(module: VLGSModule, step: int) -> Step:
     """What the step comes to; its numbers are copies."""
-    blended: list[float] = []
-    right = module._blended_loss
-
-    def watched(plan: BlendPlan, *args: Any) -> Tensor:
-        loss = right(plan, *args)
-        if plan.weight > 0:
-            blended.append(loss.item() / plan.weight)
-        return loss
-
-    with patch.object(module, "_blended_loss", watched):
-        run_step(module, step)
-    images = [i for r in module.report.renders for i in (r.color, r.feature) if i is not None]
+    _, done = _run(module, step)
+    renders = [render.detach() for render in done.seen.renders]
+    images = [i for r in renders for i in (r.color, r.feature) if i is not None]
     gradients = {
         name: p.grad.double() for name, p in module.model.named_parameters() if p.grad is not None
     }
-    outcome = Outcome(tuple(image.detach().double() for image in images), gradients)
-    return Step(module.report.loss, outcome, blended[0] if blended else None)
+    outcome = Outcome(tuple(image.double() for image in images), gradients)
+    weight, blended = done.seen.log.get("blend_weight", 0.0), done.terms.get("blended")
+    error = blended.item() / weight if blended is not None and weight > 0 else None
+    return Step(float(done.total.detach()), outcome, error)

@@ -110,8 +110,8 @@ def stages(root: Path, started: float, codecs: Path) -> list[tuple[str, float, f
 
 def _training(module: "VLGSModule") -> Iterator[tuple[str, Callable[[], object]]]:
     def decode() -> None:
-        for index in range(len(module.scene.train)):
-            module.target(index)
+        for index in range(len(module.views.scene.train)):
+            module.views[index]
 
     yield "first step", lambda: module.training_step(0, 0)
     yield "every view decoded once", decode

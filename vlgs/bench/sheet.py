@@ -43,11 +43,17 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#55
 DPI = 200
 
 
-def provenance(seed: int | None, **notes: object) -> dict[str, object]:
-    """Who measured what: the lines above a CSV. Ask for it before measuring, so that the load is that of the others."""
+def provenance(seed: int | None, program: str = "vlgs.bench", **notes: object) -> dict[str, object]:
+    """Who measured what: the lines above a CSV. Ask for it before measuring, so that the load is that of the others.
+
+    Args:
+        seed: Of what was drawn.
+        program: The module that was run.
+        notes: Further lines, or others in the place of those above.
+    """
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     return {
-        "command": shlex.join(["python", "-m", "vlgs.bench", *without_places(sys.argv[1:])]),
+        "command": shlex.join(["python", "-m", program, *without_places(sys.argv[1:])]),
         **machine(),
         "isa": instruction_set(),
         "load": f"{load} (one-minute average when it began)",

@@ -16,8 +16,9 @@ from vlgs.bench.memory import MIB
 from vlgs.bench.one_step import Step, StepSwitch, measure_step, run_steps, step_switches, turned
 from vlgs.bench.outcome import Errors, compare
 from vlgs.geometry import camera_center
-from vlgs.module.blended import BlendPlan
 from vlgs.module.lightning import VLGSModule
+from vlgs.objectives import BlendedView
+from vlgs.objectives.between import BlendPlan
 from vlgs.types import Camera
 
 STEPS = 4
@@ -162,7 +163,7 @@ class _Pair:
         return Check(scene, f"{promise}, camera", self.detour, skip.on + 1e-5)
 
     def _kept_mib(self) -> float | None:
-        return None if self.on.frozen is None else self.on.frozen.views.used / MIB
+        return None if self.on.step.frozen is None else self.on.step.frozen.views.used / MIB
 
     def _bound(self, off: Step) -> float | None:
         """How far the loss may move."""
@@ -183,22 +184,24 @@ class _Pair:
             if on is None:
                 taken[step] = off.weight
             elif on.reuse is not None:
-                cameras = [self.on.scene.train[i].camera for i in self.on.sampler.pair(step)]
+                cameras = [
+                    self.on.views.scene.train[i].camera for i in self.on.views.sampler.pair(step)
+                ]
                 taken[step] = _detour(on.camera, off.camera, *cameras)
                 self.detour = max(self.detour, taken[step])
         self.skipped = len(taken) / max(len(wanted), 1)
         if wanted and not taken and self.switch.skip.name == "blend_zero":
             # No two views of most scenes are so unlike each other: it is shown as if all were.
-            self.on.skips.similarities = self.off.skips.similarities = _Unlike()
+            self.on.views.similarities = self.off.views.similarities = _Unlike()
             taken = dict.fromkeys(wanted, 0.0)
         self.steps = sorted(taken, key=lambda s: -taken[s])[:STEPS] or self.steps
 
 
 def _plan(module: VLGSModule, step: int) -> BlendPlan | None:
-    pair = module.sampler.pair(step)
-    if pair[0] == pair[1]:
-        return None
-    return module._plan_blend(step, *(module.target(index) for index in pair))
+    first, second = module.views.sampler.pair(step)
+    objective = module.step.setup.objectives["blended_view"]
+    assert isinstance(objective, BlendedView)
+    return objective.plan(step, (module.views[first], module.views[second]))
 
 
 def _detour(used: Camera, meant: Camera, first: Camera, second: Camera) -> float:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from vlgs.values import require_range
+from vlgs.values import require_choice, require_range
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class AttributeConfig:
         require_range("attribute", 1, 4096, width=self.width)
         require_range("attribute", 0, 1, rate=self.rate)
         require_range("attribute", -1e6, 1e6, start=self.start)
-        _require_choice("attribute", "activation", self.activation, ("none", "exp", "logistic"))
+        require_choice("attribute", "activation", self.activation, ("none", "exp", "logistic"))
         _require_choice("attribute", "blended_by", self.blended_by, ("opacity", "indicator", None))
 
 

@@ -75,9 +75,7 @@ def complete(params: Parameters, width: int) -> dict[str, Tensor]:
     return conform(params, table | {n: row for n, row in absent.items() if n not in params})
 
 
-def at_levels(
-    logits: Float[Tensor, " n *levels"], levels: int | None
-) -> Float[Tensor, " n *asked"]:
+def at_levels(logits: Float[Tensor, "n ..."], levels: int | None) -> Float[Tensor, "n ..."]:
     """Weights of so many mask levels, or one for all.
 
     One becomes several equal ones; several become one by the mean of their logits, as do those of another number of levels.

@@ -145,7 +145,7 @@ def parse_ply(path: str | Path, attributes: Attributes = STANDARD) -> dict[str, 
         attributes = {**attributes, "features": replace(attributes["features"], columns="semantic")}
     params = {}
     for name, row in attributes.items():
-        names = _columns_of(row, vertices)
+        names = _columns_of(replace(row, shape=STANDARD.get(name, row).shape), vertices)
         if names is None:
             continue
         columns = np.empty((count, len(names)), np.float32)

@@ -12,10 +12,10 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from vlgs.blend import UniformBlend, blend_camera
+from vlgs.data.sampler import nearest_views
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.fields.splat import SplatModel
 from vlgs.files import write_atomically
-from vlgs.module.sampler import nearest_views
 from vlgs.types import Camera, Scene, View
 from vlgs.values import require_range
 

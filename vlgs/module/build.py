@@ -4,11 +4,13 @@ import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
+import torch
 from torch import Tensor
 
 from vlgs.blend import ViewBlend
 from vlgs.codec import Codec
 from vlgs.codec.autoencoder import Autoencoder
+from vlgs.data.sampler import PairSampler, nearest_views
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
@@ -16,10 +18,12 @@ from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, ini
 from vlgs.gaussians.background import with_background
 from vlgs.indicator import Indicator, PerLevel
 from vlgs.interchange import load_weights, start_from
-from vlgs.losses import Losses
 from vlgs.module.lift import lift_features
 from vlgs.module.lightning import VLGSModule
-from vlgs.module.settings import TrainerConfig
+from vlgs.module.settings import SkipConfig, TrainerConfig
+from vlgs.objectives import Objective, Setup
+from vlgs.objectives.targets import TrainingViews
+from vlgs.skip_count import SkipCount
 from vlgs.types import RasterConfig, Scene
 
 log = logging.getLogger(__name__)
@@ -35,7 +39,8 @@ class Parts:
     indicator: Indicator
     blend: ViewBlend
     codec: Codec
-    loss: Losses
+    loss: Mapping[str, Objective]
+    """Name -> objective."""
     raster: RasterConfig
     trainer: TrainerConfig
 
@@ -95,7 +100,33 @@ def build_module(
         evaluated=config.color == "evaluated",
         attributes=attributes,
     )
-    module = VLGSModule(model, scene, parts.blend, parts.loss, config, parts.trainer, seed, color)
+    objectives = {n: o for n, o in parts.loss.items() if color or "color" not in o.needs}
+    setup = bind(objectives, scene, model, parts.blend, parts.trainer.skip, seed)
+    module = VLGSModule(model, setup, config, parts.trainer, seed)
     if config.init_features == "lifted":
         lift_features(module)
     return module
+
+
+def bind(
+    objectives: Mapping[str, Objective],
+    scene: Scene,
+    model: SplatModel,
+    blend: ViewBlend,
+    skip: SkipConfig,
+    seed: int,
+) -> Setup:
+    """Show a scene to objectives, with the codes that the model's codec gives its masks."""
+    cameras = [view.camera for view in scene.train]
+    near = nearest_views(cameras, blend.neighbours) if blend.pairs == "neighbours" else None
+    sampler = PairSampler(tuple((c.width, c.height) for c in cameras), seed, near)
+    codes = torch.zeros(0, model.splats["features"].shape[1])
+    if len(scene.mask_vectors) > 0:
+        with torch.no_grad():
+            codes = model.codec.encode(scene.mask_vectors)
+    counts = SkipCount()
+    views = TrainingViews(scene, codes, sampler, counts)
+    setup = Setup(views, objectives, blend, skip.blend_weight, skip.blend_reuse, counts)
+    for objective in objectives.values():
+        objective.bind(setup)
+    return setup

@@ -35,14 +35,15 @@ class Densification(L.Callback):
     ) -> None:
         """Gather the screen gradients of this iteration, then change the Gaussians when it is time."""
         module = _own(pl_module)
-        config, done = module.gaussians_config, module.next_step
+        densifying, done = module.densifying, module.next_step
+        config = densifying.config
         if done >= config.densify.stop:
             return
-        state, views = module.densify_state, module.sampler.pair(done - 1)
+        state, pair = densifying.state, module.views.sampler.pair(done - 1)
         for index, gradient, render in zip(
-            views, module.screen_gradients, module.report.renders, strict=True
+            pair, module.report.screen_gradients, module.report.renders, strict=True
         ):
-            camera = module.scene.train[index].camera
+            camera = module.views.scene.train[index].camera
             state.accumulate(gradient, render.visible, camera.width, camera.height)
         if config.densify.densifies_at(done):
             densify(
@@ -50,10 +51,10 @@ class Densification(L.Callback):
                 module.optimizer,
                 state,
                 config,
-                module.extent,
+                densifying.extent,
                 module.seed,
                 done,
-                module.centers,
+                densifying.centers,
                 module.model.attributes,
             )
         if config.densify.resets_at(done):
@@ -73,9 +74,9 @@ class Silence(L.Callback):
     ) -> None:
         """Do so when it is time."""
         module = _own(pl_module)
-        share, features = module.gaussians_config.silent_above, module.model.splats["features"]
+        share, features = module.densifying.config.silent_above, module.model.splats["features"]
         done = module.next_step == module.settings.iterations
-        if done and share < 1 and module.has_language and features.requires_grad:
+        if done and share < 1 and module.views.has_language and features.requires_grad:
             silence(module, share)
 
 
@@ -185,7 +186,7 @@ class CurveLog(L.Callback):
             "loss": report.loss,
             "psnr": psnr_of(report.color_mse),
             "n_gaussians": module.model.count,
-            "blend_weight": report.blend_weight,
+            "blend_weight": report.log.get("blend_weight", 0.0),
             "seconds": module.train_seconds,
         }
         cells = [module.next_step, *(f"{value:.6g}" for value in row.values())]

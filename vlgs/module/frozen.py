@@ -8,8 +8,8 @@ from torch import Tensor
 
 from vlgs.fields.frozen import FrozenViews
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
-from vlgs.module.skips import SkipCount
 from vlgs.ops.frozen import FrozenView
+from vlgs.skip_count import SkipCount
 from vlgs.types import Camera, Shape
 
 

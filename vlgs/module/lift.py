@@ -18,8 +18,8 @@ def lift_features(module: VLGSModule) -> None:
         weight = module.model.fuse().language_weight
     weights = [weight] * levels if weight.dim() == 1 else [w.contiguous() for w in weight.unbind(1)]
     total = features.new_zeros(levels, len(features), features.shape[1] // levels + 1)
-    for index in range(len(module.scene.train)):
-        target = module.target(index)
+    for index in range(len(module.views.scene.train)):
+        target = module.views[index]
         if target.codes is None or target.valid is None:
             continue
         seen = target.valid[..., None].to(features)
@@ -38,7 +38,7 @@ def gathered(
 ) -> Float[Tensor, "n c"]:
     """Per Gaussian the sum over pixels of its blending weight times the image."""
     values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
-    camera = module.scene.train[index].camera
+    camera = module.views.scene.train[index].camera
     with torch.enable_grad():
         rendered = module.model.render_values(camera, values, weight)
         return torch.autograd.grad(rendered, values, image)[0]

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vlgs.module.lift import gathered
-from vlgs.module.lightning import VLGSModule, covered
+from vlgs.module.lightning import VLGSModule
+from vlgs.objectives.targets import covered
 
 MAX_VIEWS = 64
 """Views that are asked, evenly chosen."""
@@ -36,13 +37,13 @@ def silence(module: VLGSModule, share: float) -> int:
 
 def outside_masks(module: VLGSModule) -> Float[Tensor, "n levels"]:
     """Share of a Gaussian's language weight that lies outside of masks; 0 where no view sees it."""
-    model, views = module.model, module.scene.train
+    model, views = module.model, module.views.scene.train
     with torch.no_grad():
         weight = model.fuse().language_weight
     levels = [weight] * model.levels if weight.dim() == 1 else list(weight.T.contiguous())
     total = torch.zeros(len(weight), model.levels, 2)
     for index in range(0, len(views), -(-len(views) // MAX_VIEWS)):
-        valid, seen = module.target(index).valid, covered(views[index])
+        valid, seen = module.views[index].valid, covered(views[index])
         if valid is None:
             continue
         for level, own in enumerate(levels):

@@ -24,9 +24,9 @@ from vlgs.module.joint import join_levels
 from vlgs.module.lift import lift_features
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.separate import for_language, unite, without_language
-from vlgs.module.skips import SkipCount
 from vlgs.module.state import capture
 from vlgs.runs import RunFolder
+from vlgs.skip_count import SkipCount
 from vlgs.types import Scene
 
 log = logging.getLogger(__name__)

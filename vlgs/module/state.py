@@ -13,14 +13,14 @@ from vlgs.module.lightning import VLGSModule
 def capture(module: VLGSModule, meta: dict[str, Any]) -> Checkpoint:
     """Everything the next iteration depends on: parameters, weights, Adam's moments, densification statistics."""
     tensors: dict[str, Tensor] = {f"model.{k}": v for k, v in module.model.state_dict().items()}
-    if module.exposure is not None:
-        tensors |= {f"exposure.{k}": v for k, v in module.exposure.state_dict().items()}
+    for name, part in _beside(module).items():
+        tensors |= {f"{name}.{k}": v for k, v in part.state_dict().items()}
     for group in module.optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):
             for key, value in module.optimizer.state.get(parameter, {}).items():
                 tensors[f"adam.{group['name']}.{index}.{key}"] = value
-    tensors["densify.grad_sum"] = module.densify_state.grad_sum
-    tensors["densify.count"] = module.densify_state.count
+    tensors["densify.grad_sum"] = module.densifying.state.grad_sum
+    tensors["densify.count"] = module.densifying.state.count
     own = {
         "train_seconds": module.train_seconds,
         "results_version": RESULTS_VERSION,
@@ -41,8 +41,8 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
     if version != RESULTS_VERSION:
         raise ValueError(f"resume: results version must be {RESULTS_VERSION}, got {version}")
     _restore_model(module, _below(checkpoint.tensors, "model."))
-    if module.exposure is not None:
-        module.exposure.load_state_dict(_below(checkpoint.tensors, "exposure."))
+    for name, part in _beside(module).items():
+        part.load_state_dict(_below(checkpoint.tensors, f"{name}."))
     adam = _below(checkpoint.tensors, "adam.")
     module.optimizer.state.clear()
     for group in module.optimizer.param_groups:
@@ -50,12 +50,17 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
             state = _below(adam, f"{group['name']}.{index}.")
             if state:
                 module.optimizer.state[parameter] = state
-    module.densify_state.grad_sum = checkpoint.tensors["densify.grad_sum"]
-    module.densify_state.count = checkpoint.tensors["densify.count"]
+    module.densifying.state.grad_sum = checkpoint.tensors["densify.grad_sum"]
+    module.densifying.state.count = checkpoint.tensors["densify.count"]
     module.next_step = checkpoint.step
     module.train_seconds = float(checkpoint.meta["train_seconds"])
     module.skips.restore(checkpoint.meta.get("skips", {}))
     module.model.sh_degree = int(checkpoint.meta["sh_degree"])
+
+
+def _beside(module: VLGSModule) -> dict[str, nn.Module]:
+    """What is trained and is no part of the model."""
+    return {name: part for name, part in module.step.modules().items() if name != "fusion"}
 
 
 def _restore_model(module: VLGSModule, tensors: dict[str, Tensor]) -> None:

@@ -71,8 +71,8 @@ class StuckAlarm(L.Callback):
         if pl_module.next_step % self.every:
             return
         means2d = [render.mean2d for render in pl_module.report.renders]
-        views = pl_module.sampler.pair(pl_module.next_step - 1)
-        cameras = [pl_module.scene.train[index].camera for index in views]
+        views = pl_module.views.sampler.pair(pl_module.next_step - 1)
+        cameras = [pl_module.views.scene.train[index].camera for index in views]
         weights = (r.name for r in pl_module.model.attributes.values() if r.role == "weight")
         for name in weights:
             gradient = pl_module.model.splats[name].grad

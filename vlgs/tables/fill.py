@@ -1,17 +1,15 @@
-"""Computes the numbers of one table from runs: mean and deviation over seeds, beside the paper's value.
+"""Computes the numbers of one table from runs: mean and deviation over seeds, beside the paper's value."""
 
-Plain loops, because pandas is slow on frames as small as those of one table.
-"""
-
+import itertools
 import math
-import statistics
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import pandas as pd
+
 from vlgs.config import split_override
 from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
-from vlgs.tables.frame import Line, Lines
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE, Table
 
@@ -69,68 +67,52 @@ class Filled:
     """Every place of the table, row by row."""
     numbers: Sequence[Number]
     """Every single number behind the cells."""
-    runs: Sequence[Line]
-    """One line of each run behind the cells."""
+    runs: pd.DataFrame
+    """One line of each run behind the cells, as `vlgs.tables.frame.tidy` has it."""
     provenance: tuple[str, ...]
     """Machine, commit, protocol, seeds and data of those runs, as text."""
 
 
-def fill(table: Table, benchmark: Benchmark, composer: Composer, lines: Lines) -> Filled:
+def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataFrame) -> Filled:
     """Look up the runs of every row.
 
     Args:
         table: What to fill.
         benchmark: Data, scenes and seeds.
         composer: Of the same benchmark.
-        lines: Of all runs.
+        frame: Of all runs, as `vlgs.tables.frame.tidy` has it.
 
     Raises:
         UnknownOptionError: If a row names an option that does not exist; the file and the row are named.
     """
-    entries = {QUANTITIES[name].entry for name in table.metrics}
-    entries = {"per_category"} if table.by_category else entries
-    scenes, seeds = set(benchmark.scenes), set(benchmark.seeds)
-    numbers: list[Number] = []
-    runs: dict[str, Line] = {}
-    recipes: dict[int, str] = {}
-    for index, row in enumerate(table.rows):
-        if row.overrides is None:
-            continue
-        try:
-            wanted = composer.identity(row.overrides, benchmark.seeds[0])
-        except UnknownOptionError as error:
-            where = f"{table.source}: rows[{index}].set"
-            raise UnknownOptionError(
-                f"{where} must be options of the configuration, got {error}"
-            ) from error
-        recipes[index] = wanted.recipe
-        found = [
-            line
-            for line in lines.get((wanted.recipe, wanted.data), ())
-            if line.metric in entries and line.scene in scenes and line.seed in seeds
-        ]
-        runs |= {line.config_hash: line for line in found}
-        numbers.extend(_numbers(index, table, found, several=len(scenes) > 1))
+    rows = _rows(table, benchmark, composer)
+    scenes, several = benchmark.scenes, len(set(benchmark.scenes)) > 1
+    mine = frame[frame["recipe"].isin(rows["recipe"])]
+    mine = mine[mine["scene"].isin(scenes) & mine["seed"].isin(benchmark.seeds)]
+    found = rows.merge(mine, on=["recipe", "data_recipe"]).merge(_entries(table), on="metric")
+    numbers = found.assign(value=found["value"] * found["factor"], metric=found["name"])
     if table.by_category:
-        numbers.extend(_kind_means(numbers))
+        numbers = _of_categories(table, numbers, several).dropna(subset="value")
+        numbers = pd.concat([numbers, _kind_means(numbers)])
         columns = _category_columns(table, numbers)
     else:
-        numbers.extend(_averages(numbers, benchmark.scenes))
-        named = (*benchmark.scenes, AVERAGE) if len(scenes) > 1 else benchmark.scenes
-        columns = dict.fromkeys(named, "")
+        numbers = numbers.assign(column=numbers["scene"]).dropna(subset="value")
+        numbers = pd.concat([numbers, _averages(numbers, len(scenes))])
+        columns = dict.fromkeys((*scenes, AVERAGE) if several else scenes, "")
     dataset = dict(map(split_override, benchmark.overrides)).get("data", "synthetic")
-    same = dataset == table.dataset and scenes <= set(table.scenes.values())
+    same = dataset == table.dataset and set(scenes) <= set(table.scenes.values())
+    runs = found.drop_duplicates("config_hash")[list(frame.columns)]
     return Filled(
         table=table,
         benchmark=benchmark,
         columns=tuple(columns),
         kinds={column: kind for column, kind in columns.items() if kind},
-        recipes=recipes,
+        recipes=dict(zip(rows["row"], rows["recipe"], strict=True)),
         same_scenes=same,
         cells=dict(_cells(table, tuple(columns), numbers, same)),
-        numbers=numbers,
-        runs=tuple(runs.values()),
-        provenance=_provenance(benchmark, runs.values()),
+        numbers=[Number(*each) for each in numbers[list(Number._fields)].itertuples(index=False)],
+        runs=runs,
+        provenance=_provenance(benchmark, runs),
     )
 
 
@@ -144,98 +126,88 @@ def printed_name(category: str) -> str:
     return category.replace(" ", "_")
 
 
-def _numbers(index: int, table: Table, found: Sequence[Line], several: bool) -> Iterator[Number]:
-    """Numbers of one row; categories of several scenes carry the scene's name."""
-    only = set(table.kinds.values())
-    for name in table.metrics:
-        quantity = QUANTITIES[name]
-        entry = "per_category" if table.by_category else quantity.entry
-        for line in found:
-            if line.metric != entry or math.isnan(line.value):
-                continue
-            column, kind = line.scene, line.kind
-            if table.by_category:
-                kind = kind or table.kinds.get(printed_name(line.category), "")
-                column = f"{line.scene}: {line.category}" if several else line.category
-            if len(only) != 1 or kind in only:
-                yield Number(index, column, kind, name, line.seed, line.value * quantity.factor)
+def _rows(table: Table, benchmark: Benchmark, composer: Composer) -> pd.DataFrame:
+    """Number, recipe and data recipe of the rows that can be run."""
+    rows = []
+    for index, row in enumerate(table.rows):
+        if row.overrides is None:
+            continue
+        try:
+            wanted = composer.identity(row.overrides, benchmark.seeds[0])
+        except UnknownOptionError as error:
+            where = f"{table.source}: rows[{index}].set"
+            raise UnknownOptionError(
+                f"{where} must be options of the configuration, got {error}"
+            ) from error
+        rows.append((index, wanted.recipe, wanted.data))
+    return pd.DataFrame(rows, columns=["row", "recipe", "data_recipe"])
 
 
-def _kind_means(numbers: Sequence[Number]) -> list[Number]:
-    """Mean over the categories of a kind per seed, where every category has a number; kinds of one category have none."""
-    columns: dict[str, set[str]] = {}
-    groups: dict[tuple[int, str, str, int], list[float]] = {}
-    for number in numbers:
-        columns.setdefault(number.kind, set()).add(number.column)
-        key = (number.row, number.kind, number.metric, number.seed)
-        groups.setdefault(key, []).append(number.value)
-    return [
-        Number(row, MEAN + kind, kind, metric, seed, statistics.fmean(values))
-        for (row, kind, metric, seed), values in groups.items()
-        if kind and len(values) == len(columns[kind]) > 1
+def _entries(table: Table) -> pd.DataFrame:
+    """Which entry of a run is which quantity of the table, and by what it is multiplied."""
+    quantities = [(name, QUANTITIES[name]) for name in table.metrics]
+    entries = [
+        ("per_category" if table.by_category else q.entry, name, q.factor) for name, q in quantities
     ]
+    return pd.DataFrame(entries, columns=["metric", "name", "factor"])
 
 
-def _category_columns(table: Table, numbers: Sequence[Number]) -> dict[str, str]:
+def _of_categories(table: Table, numbers: pd.DataFrame, several: bool) -> pd.DataFrame:
+    """The categories as columns, those of several scenes with the scene's name, and of the kinds of the table where it has one alone."""
+    printed = numbers["category"].map(printed_name)
+    kind = numbers["kind"].where(numbers["kind"] != "", printed.map(table.kinds).fillna(""))
+    column = numbers["scene"] + ": " + numbers["category"] if several else numbers["category"]
+    numbers, only = numbers.assign(kind=kind, column=column), set(table.kinds.values())
+    return numbers[kind.isin(only)] if len(only) == 1 else numbers
+
+
+def _kind_means(numbers: pd.DataFrame) -> pd.DataFrame:
+    """Mean over the categories of a kind per seed, where every category has a number; kinds of one category have none."""
+    means = _means(numbers[numbers["kind"] != ""], ["row", "kind", "metric", "seed"])
+    wanted = means["kind"].map(numbers.groupby("kind")["column"].nunique())
+    means = means[(means["count"] == wanted) & (wanted > 1)]
+    return means.assign(column=MEAN + means["kind"])
+
+
+def _averages(numbers: pd.DataFrame, scenes: int) -> pd.DataFrame:
+    """Mean over scenes per seed, where every scene has a number."""
+    means = _means(numbers, ["row", "metric", "seed"])
+    return means[means["count"] == scenes].assign(column=AVERAGE, kind="")
+
+
+def _means(numbers: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    groups = numbers.groupby(by, sort=False)["value"]
+    return groups.agg(value="mean", count="count").reset_index()
+
+
+def _category_columns(table: Table, numbers: pd.DataFrame) -> dict[str, str]:
     """Category -> kind, kinds together and the mean of each last; the paper's categories where there is no run."""
-    if not numbers:
+    if numbers.empty:
         return dict(table.kinds)
-    pairs = {(number.column, number.kind) for number in numbers}
+    pairs = set(zip(numbers["column"], numbers["kind"], strict=True))
     return dict(sorted(pairs, key=lambda pair: (pair[1], pair[0].startswith(MEAN), pair[0])))
 
 
-def _averages(numbers: Sequence[Number], scenes: Sequence[str]) -> list[Number]:
-    """Mean over scenes per seed, where every scene has a number."""
-    groups: dict[tuple[int, str, int], list[float]] = {}
-    for number in numbers:
-        groups.setdefault((number.row, number.metric, number.seed), []).append(number.value)
-    return [
-        Number(row, AVERAGE, "", metric, seed, statistics.fmean(values))
-        for (row, metric, seed), values in groups.items()
-        if len(values) == len(scenes)
-    ]
-
-
 def _cells(
-    table: Table, columns: Sequence[str], numbers: Sequence[Number], same: bool
+    table: Table, columns: Sequence[str], numbers: pd.DataFrame, same: bool
 ) -> Iterator[tuple[Place, Cell]]:
     names = {scene: paper for paper, scene in table.scenes.items()} | {AVERAGE: AVERAGE}
-    groups: dict[Place, list[float]] = {}
-    for number in numbers:
-        place = Place(number.row, number.column, number.metric)
-        groups.setdefault(place, []).append(number.value)
-    for index, row in enumerate(table.rows):
-        for column in columns:
-            for metric in table.metrics:
-                place = Place(index, column, metric)
-                mean, std, seeds = _spread(groups.get(place, []))
-                paper = math.nan
-                if same:
-                    printed = printed_name(column) if table.by_category else names.get(column, "")
-                    paper = row.paper.get(printed, {}).get(metric, math.nan)
-                elif column == AVERAGE:
-                    paper = row.paper.get(AVERAGE, {}).get(metric, math.nan)
-                difference = mean - paper if same else math.nan
-                yield place, Cell(mean, std, seeds, paper, difference)
+    groups = numbers.groupby(list(Place._fields))["value"].agg(["mean", "std", "count"])
+    spread = dict(zip(groups.index, groups.itertuples(index=False, name=None), strict=True))
+    for place in itertools.starmap(
+        Place, itertools.product(range(len(table.rows)), columns, table.metrics)
+    ):
+        mean, std, seeds = spread.get(place, (math.nan, math.nan, 0))
+        paper, column = table.rows[place.row].paper, place.column
+        printed = printed_name(column) if table.by_category else names.get(column, "")
+        known = same or column == AVERAGE
+        theirs = paper.get(printed, {}).get(place.metric, math.nan) if known else math.nan
+        yield place, Cell(mean, std, seeds, theirs, mean - theirs if same else math.nan)
 
 
-def _spread(values: Sequence[float]) -> tuple[float, float, int]:
-    """Mean, deviation with n - 1, and how many."""
-    if not values:
-        return math.nan, math.nan, 0
-    mean = statistics.fmean(values)
-    if len(values) == 1:
-        return mean, math.nan, 1
-    squares = math.fsum((value - mean) ** 2 for value in values)
-    return mean, math.sqrt(squares / (len(values) - 1)), len(values)
-
-
-def _provenance(benchmark: Benchmark, runs: Collection[Line]) -> tuple[str, ...]:
+def _provenance(benchmark: Benchmark, runs: pd.DataFrame) -> tuple[str, ...]:
     def all_of(column: str) -> str:
-        return (
-            ", ".join(sorted({str(v) for r in runs if (v := getattr(r, column)) is not None}))
-            or "--"
-        )
+        return ", ".join(sorted(map(str, runs[column].dropna().unique()))) or "--"
 
     return (
         f"data: {' '.join(benchmark.overrides)}; scenes {', '.join(benchmark.scenes)}; "

@@ -38,9 +38,6 @@ class Line(NamedTuple):
     """NaN where it could not be computed."""
 
 
-Lines = Mapping[tuple[str, str], Sequence[Line]]
-"""(recipe, data recipe) -> lines of its runs."""
-
 RUN_COLUMNS = Line._fields[: Line._fields.index("cpu")]
 
 DETAILS = {"per_category", "category_kinds", "indicator", "per_view", "reasons", "machine", "skips"}
@@ -159,14 +156,6 @@ def _line(*row: str) -> Line:
         value=value,
         **{name: getattr(line, name) or None for name in ("protocol", "commit", "cpu")},
     )
-
-
-def by_row(lines: Iterable[Line]) -> Lines:
-    """The lines of each row of a table together."""
-    rows: dict[tuple[str, str], list[Line]] = {}
-    for line in lines:
-        rows.setdefault((line.recipe, line.data_recipe), []).append(line)
-    return rows
 
 
 def tidy(lines: Sequence[Line]) -> pd.DataFrame:

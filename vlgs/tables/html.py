@@ -38,7 +38,7 @@ def write_report(
         write_atomically(pictures / f"{name}.png", png)
         return f"plots/{name}.png"
 
-    hashes = {run.config_hash for table in filled for run in table.runs}
+    hashes = {name for table in filled for name in table.runs["config_hash"]}
     mine = frame[frame["config_hash"].isin(hashes)]
     full = _full_model(filled)
     whole = [
@@ -118,8 +118,8 @@ def _full_model(filled: Sequence[Filled]) -> list[Line]:
     for table in filled:
         for index, recipe in table.recipes.items():
             if table.table.rows[index].overrides == ():
-                runs = [run for run in table.runs if run.recipe == recipe]
-                return sorted(runs, key=lambda run: (run.scene, run.seed))
+                runs = table.runs[table.runs["recipe"] == recipe].sort_values(["scene", "seed"])
+                return [Line(*run) for run in runs.itertuples(index=False)]
     return []
 
 

@@ -11,7 +11,6 @@ from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import (
     Line,
     add_kept,
-    by_row,
     read_metrics,
     require_one_meaning,
     tidy,
@@ -64,7 +63,7 @@ def write_all(
         _say_older(lines)
         if not current:
             return []  # and leave what was written of them as it is
-    rows = by_row(current)
+    counted = tidy(current)
     refused: dict[str, UnknownOptionError] = {}
     fitting: set[str] = set()
     for file in files:
@@ -73,13 +72,13 @@ def write_all(
         filled: list[Filled] = []
         for table in tables:
             try:
-                filled.append(fill(table, benchmark, composer, rows))
+                filled.append(fill(table, benchmark, composer, counted))
                 fitting.add(table.label)
             except UnknownOptionError as error:
                 composer.require_sound(file)
                 refused[table.label] = error
         composer.save()
-        filled = [table for table in filled if table.runs]
+        filled = [table for table in filled if len(table.runs)]
         write_tables(file.parent, filled)
         if html:
             from vlgs.tables.html import (

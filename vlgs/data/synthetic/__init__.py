@@ -1,7 +1,7 @@
 """Procedural scenes: the default data of vlgs, made from nothing in seconds.
 
-How a scene is made. Everyday things (`props_shiny`, `props_matte`) stand on a round table in a lit room (`layouts`). An
-analytic ray tracer (`tracer`) photographs them from a walk around the table (`cameras`), with a class for every pixel that
+How a scene is made. Everyday things (`props.yaml`) stand on a round table (`scenes/*.yaml`, or a file of the user: `scene_file`) in a lit
+room (`room`, `layouts`). An analytic ray tracer (`tracer`) photographs them from a walk around the table (`cameras`), with a class for every pixel that
 is exact at the pixel's centre. Sparse points are drawn on what the training views see (`points`). Language supervision is the exact
 segmentation, spoilt as SAM and CLIP spoil it, at known rates and independently in every view (`masks`), with vectors that
 have the geometry of CLIP's (`language`).

@@ -5,25 +5,14 @@ from vlgs.data.synthetic.shapes import Box, cylinder, sphere
 from vlgs.data.synthetic.things import Material, Part, Thing
 
 STAGES = ("ring", "sky", "wall")
-"""What follows the name of a layout in the name of a scene: the room, seen from a ring; under a sky, from a ring; before a
-plain wall, from an arc."""
+"""Other stages than the room that is seen from a walk: the room, seen from a ring; under a sky, from a ring; before a plain wall, from an
+arc."""
 VERSION = 1
 """Part of the fingerprint of these scenes; raise it with any change that moves one of their pixels, labels or points."""
 
 _SKY_RADIUS = 40.0
 _WALL_DISTANCE = 3.0
 _PATIO_RADIUS = 1.7
-
-
-def name_parts(scene: str) -> tuple[str, str | None]:
-    """Layout and stage of a scene's name; the stage is None in the room, seen from the walk.
-
-    Example:
-        >>> name_parts("mirrors_sky"), name_parts("mirrors")
-        (('mirrors', 'sky'), ('mirrors', None))
-    """
-    layout, _, stage = scene.partition("_")
-    return layout, stage or None
 
 
 def surroundings(stage: str, floor: float) -> tuple[Thing, ...]:

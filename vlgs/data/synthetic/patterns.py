@@ -113,7 +113,9 @@ class Cells:
         """See `Pattern`."""
         # A surface that lies exactly on a cell border is drawn a hair inwards, or rounding would speckle it.
         i, j, k = np.floor(point * 0.999 / np.array(self.size)[:, None] + 0.5)
-        patch = ((i + 16) * 32 + (j + 16)) * 32 + (k + 16)
+        # Five bits for each: cells farther out than the sixteenth share a number.
+        a, b, c = (np.clip(n, -16, 15) + 16 for n in (i, j, k))
+        patch = (a * 32 + b) * 32 + c
         color = _pick(self.colors, i + 2 * j + 3 * k + 60)
         return color * (1 + self.grain * _grain(point, 0.5)), patch.astype(np.uint16)
 

@@ -1,11 +1,12 @@
 """The settings that determine a procedural scene."""
 
 import hashlib
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, field
 
 from vlgs.data.synthetic import outdoors
-from vlgs.data.synthetic.layouts import DIFFICULTIES, SCENES, STAGED
+from vlgs.data.synthetic.layouts import DIFFICULTIES
 from vlgs.data.synthetic.masks import Faults
+from vlgs.data.synthetic.scene_file import SceneFile, find_scene
 
 VERSION = 1
 """Part of every fingerprint; raise it with any change that moves a pixel, a label, a point or a vector."""
@@ -17,7 +18,7 @@ MAX_VIEWS = 9999
 class Recipe:
     """All parameters but the mask level; `load_scene` says what they mean."""
 
-    scene: str = "glassware"
+    scene: SceneFile = field(default_factory=lambda: find_scene("glassware"))
     difficulty: str = "easy"
     width: int = 200
     height: int = 150
@@ -28,14 +29,10 @@ class Recipe:
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self):
-        for name, value, options in (
-            ("scene", self.scene, (*SCENES, *STAGED)),
-            ("difficulty", self.difficulty, DIFFICULTIES),
-        ):
-            if value not in options:
-                raise ValueError(
-                    f"synthetic: {name} must be one of {', '.join(options)}, got {value!r}"
-                )
+        if self.difficulty not in DIFFICULTIES:
+            raise ValueError(
+                f"synthetic: difficulty must be one of {', '.join(DIFFICULTIES)}, got {self.difficulty!r}"
+            )
         for name, low, high in (
             ("width", 16, 8192),
             ("height", 16, 8192),
@@ -50,9 +47,11 @@ class Recipe:
                 )
 
     def fingerprint(self, level: int) -> str:
-        """Hash of the parameters, with faults as they come out, and of the generator's version."""
-        resolved = replace(self, faults=self.faults.resolve(self.difficulty))
-        text = f"vlgs.data.synthetic {VERSION} {astuple(resolved)} {level}"
-        if self.scene in STAGED:
+        """Hash of the parameters, the content of a scene file among them, with faults as they come out, and of the generator's version."""
+        sizes = (self.width, self.height, self.train_views, self.test_views)
+        faults = astuple(self.faults.resolve(self.difficulty))
+        content = (self.scene.key, self.difficulty, *sizes, self.seed, self.points, faults)
+        text = f"vlgs.data.synthetic {VERSION} {content} {level}"
+        if self.scene.outdoors:
             text += f" outdoors {outdoors.VERSION}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

@@ -15,6 +15,7 @@ from vlgs.data.synthetic.masks import Faults, LevelMasks, view_masks
 from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.points import view_points
 from vlgs.data.synthetic.recipe import MAX_VIEWS, Recipe
+from vlgs.data.synthetic.scene_file import find_scene
 from vlgs.data.synthetic.studio import Shot, Studio, open_studio, regions
 from vlgs.types import Camera, Scene, View
 
@@ -40,6 +41,7 @@ def load_scene(
 
     Args:
         scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``; with ``_ring``, ``_sky`` or ``_wall`` after it, seen from there.
+            Or the path of a scene file of your own (conf/data/README.md).
         difficulty: ``easy``, or ``hard``: half as many things again, occlusion, about twice the faults.
         width: Pixels.
         height: Pixels; the field of view is fixed horizontally.
@@ -53,11 +55,12 @@ def load_scene(
         cache: Folder that keeps the photographs, so that the next process need not trace them; None: nothing is kept.
 
     Raises:
-        ValueError: If an argument is out of range.
+        ValueError: If an argument is out of range, or the scene file is wrong.
     """
     if level not in range(4):
         raise ValueError(f"synthetic: level must be 0, 1, 2 or 3, got {level}")
-    recipe = Recipe(scene, difficulty, width, height, train_views, test_views, seed, points, faults)
+    file = find_scene(scene)
+    recipe = Recipe(file, difficulty, width, height, train_views, test_views, seed, points, faults)
     folder = None if cache is None else Path(cache)
     studio = open_studio(recipe, folder)
     indices, vectors, offset = {}, [], 0
@@ -74,7 +77,7 @@ def load_scene(
         for shot, count in zip(studio.train, _shares(points, train_views), strict=True)
     ]
     return Scene(
-        name=scene,
+        name=file.name,
         train=tuple(_view(studio, shot, indices[shot.name]) for shot in studio.train),
         test=tuple(_view(studio, shot, None) for shot in studio.test),
         split="synthetic",
@@ -115,7 +118,7 @@ def _levels(
     recipe: Recipe, studio: Studio, photo: Photograph, number: int
 ) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
     faults = recipe.faults.resolve(recipe.difficulty)
-    key = (recipe.seed, zlib.crc32(f"{recipe.scene} {recipe.difficulty}".encode()), number)
+    key = (recipe.seed, zlib.crc32(f"{recipe.scene.key} {recipe.difficulty}".encode()), number)
     return view_masks(*regions(studio.world, photo), studio.classes, faults, key)
 
 

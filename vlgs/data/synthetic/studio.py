@@ -12,7 +12,6 @@ from jaxtyping import Int
 from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
 from vlgs.data.synthetic.layouts import build
 from vlgs.data.synthetic.masks import NO_FAULTS, Region
-from vlgs.data.synthetic.outdoors import name_parts
 from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.recipe import Recipe
 from vlgs.data.synthetic.world import World
@@ -66,7 +65,6 @@ def _open(recipe: Recipe, cache: Path | None) -> Studio:
     class_of_thing = np.array(
         [classes.index(thing.name) if thing.masked else IGNORE_ID for thing in things], np.uint8
     )
-    _, stage = name_parts(recipe.scene)
     train, test = moments(recipe.train_views, recipe.test_views)
     order = np.argsort(np.argsort(np.concatenate([train, test])))
     places = []
@@ -76,10 +74,12 @@ def _open(recipe: Recipe, cache: Path | None) -> Studio:
         held_out = len(places) >= recipe.train_views
         number = len(places) - recipe.train_views * held_out
         rng = np.random.default_rng([_WALK, recipe.seed, int(held_out), number])
-        if stage is None:
+        if not recipe.scene.outdoors:
             camera = camera_at(moment, rng, recipe.width, recipe.height)
         else:
-            stop = stop_at(stage, number, recipe.train_views, recipe.test_views if held_out else 0)
+            stop = stop_at(
+                recipe.scene.stage, number, recipe.train_views, recipe.test_views if held_out else 0
+            )
             camera = held(stop, rng, recipe.width, recipe.height)
         places.append((f"frame_{position + 1:05d}", number, camera))
     photos = _photographs(world, [camera for *_, camera in places], recipe, cache)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from vlgs.data.synthetic.layouts import LAMP
+from vlgs.data.synthetic.room import LAMP
 from vlgs.data.synthetic.shapes import Vectors
 from vlgs.data.synthetic.world import NOTHING, Hits, World, by_part
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
-from vlgs.data.synthetic.layouts import FLOOR, LAMP, ROOM, TABLE_RADIUS
+from vlgs.data.synthetic.room import FLOOR, LAMP, ROOM, TABLE_RADIUS
 from vlgs.data.synthetic.shapes import Vectors
 from vlgs.data.synthetic.things import Part, Thing
 

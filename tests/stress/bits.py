@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from vlgs.bench.stress.case import CannotRunError, Case, Verdict
-from vlgs.bench.stress.splats import make_splats, render_with_gradients, tensors_of
-from vlgs.bench.stress.training import make_module, train
+from tests.stress.case import CannotRunError, Case, Verdict
+from tests.stress.splats import make_splats, render_with_gradients, tensors_of
+from tests.stress.training import make_module, train
 from vlgs.ops import machine
 
 THREADS = (1, 2, 3)
@@ -92,7 +92,9 @@ def on(isa: str) -> Callable[[bool], Verdict]:
 
 def _in_process(isa: str, full: bool) -> dict[str, list[str]]:
     """The instruction set is chosen when the kernel is imported, so each needs a process."""
-    script = f"import json; from vlgs.bench.stress.bits import measure; print(json.dumps(measure({full})))"
+    script = (
+        f"import json; from tests.stress.bits import measure; print(json.dumps(measure({full})))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", script], env=os.environ | {"VLGS_ISA": isa},
         capture_output=True, text=True, check=False,

@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 
-from vlgs.bench.stress.case import Case, Verdict
-from vlgs.bench.stress.splats import make_splats
+from tests.stress.case import Case, Verdict
+from tests.stress.splats import make_splats
 from vlgs.config import CONF, instantiate
 from vlgs.data.synthetic import load_scene
 from vlgs.gaussians.logistic import logit

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from vlgs.bench.fuzz_scene import WEIGHTS
-from vlgs.bench.stress.case import Case, Verdict, bound, relative_error
-from vlgs.bench.stress.splats import (
+from tests.fuzz_kernel.scene import WEIGHTS
+from tests.stress.case import Case, Verdict, bound, relative_error
+from tests.stress.splats import (
     full_screen,
     make_splats,
     render,

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vlgs.bench.fuzz import fuzz
-from vlgs.bench.stress.case import Case, Verdict, bound, peak_memory, relative_error
-from vlgs.bench.stress.splats import (
+from tests.fuzz_kernel import fuzz
+from tests.stress.case import Case, Verdict, bound, peak_memory, relative_error
+from tests.stress.splats import (
     SMOOTH,
     Splats,
     full_screen,

@@ -1,7 +1,7 @@
 """Random hostile scenes through the rasterizer and back: finite numbers or a named error, nothing else (tests/README.md, N2).
 
-With each scene go random calls of the other kernels (`vlgs.bench.fuzz_layers`). A scene is a function of its seed alone, so that
-`python -m vlgs.bench fuzz --first SEED --scenes 1` runs a failure again. Refusing a tame scene is a failure too.
+With each scene go random calls of the other kernels (`tests.fuzz_kernel.layers`). A scene is a function of its seed alone, so that
+`python -m tests.fuzz_kernel --first SEED --scenes 1` runs a failure again. Refusing a tame scene is a failure too.
 """
 
 import re
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from vlgs.bench.fuzz_layers import run_frozen, run_layers
-from vlgs.bench.fuzz_scene import POISON, FuzzScene, make_scene
+from tests.fuzz_kernel.layers import run_frozen, run_layers
+from tests.fuzz_kernel.scene import POISON, FuzzScene, make_scene
 from vlgs.ops.rasterize import rasterize
 from vlgs.types import Rendered
 

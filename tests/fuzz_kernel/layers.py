@@ -1,6 +1,6 @@
 """Random input to the kernels beside the rasterizer: attention, view-dependent colour, losses, frozen views, the yardstick.
 
-What `vlgs.bench.fuzz` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
+What `tests.fuzz_kernel` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
 four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite. Squared errors are
 compared with those of torch in float64, whatever the numbers are.
 """
@@ -53,7 +53,7 @@ def run_frozen(
     """The first group of a scene as a frozen view: the same picture to rounding, finite gradients.
 
     Args:
-        tensors: Of a `vlgs.bench.fuzz_scene.FuzzScene` that was rendered without complaint.
+        tensors: Of a `tests.fuzz_kernel.scene.FuzzScene` that was rendered without complaint.
         width: Pixels.
         height: Pixels.
         config: The scene's.

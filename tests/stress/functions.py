@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from vlgs.bench.stress.case import Case, Verdict, bound
-from vlgs.bench.stress.splats import make_splats, render
+from tests.stress.case import Case, Verdict, bound
+from tests.stress.splats import make_splats, render
 from vlgs.blend.pose import slerp
 from vlgs.fields.similarity import cosines
 from vlgs.fusion.attention import CrossAttention, SelfAttention

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from vlgs.blend import ViewBlend, blend_cameras
-from vlgs.module.sampler import PairSampler
+from vlgs.data.sampler import PairSampler
 from vlgs.types import Camera
 
 AHEAD = 32

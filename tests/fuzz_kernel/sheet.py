@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pandas as pd
 
-from vlgs.bench.fuzz import FuzzReport
+from tests.fuzz_kernel import FuzzReport
+from tests.recorded import commit_with, same_code_with
 from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
-from vlgs.report.provenance import commit, same_code
 
+FOLDER = Path(__file__).parent
 CHUNK = 500
 """Scenes between two writings of the file."""
 CLEAN = "clean"
-COMMANDS = "python -m vlgs.bench fuzz; python csrc/sanitize.py"
+COMMANDS = "python -m tests.fuzz_kernel; python csrc/sanitize.py"
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ def run_fuzz(
     rows = [FuzzRow(**row) for row in _read(path)]
     mine = next((row for row in rows if (row.isa, row.sanitizers) == (isa, sanitizers)), None)
     others = [row for row in rows if row is not mine]
-    here = commit()
-    if mine is None or mine.outcome != CLEAN or not same_code(mine.commit, here):
+    here = commit_with(FOLDER)
+    if mine is None or mine.outcome != CLEAN or not same_code_with(FOLDER, mine.commit, here):
         mine = FuzzRow(isa, sanitizers, 0, 0, 0, 0, CLEAN, 0.0, here)
     elif mine.scenes:
         say(f"{isa}, sanitizers {sanitizers}: {mine.scenes} scenes are there")

@@ -9,11 +9,12 @@ from typing import Any
 
 from rich.table import Table
 
+from tests.recorded import commit_with, same_code_with
+from tests.stress.case import CannotRunError, Case
 from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
-from vlgs.bench.stress.case import CannotRunError, Case
 from vlgs.ops.machine import instruction_set
-from vlgs.report.provenance import commit, same_code
 
+FOLDER = Path(__file__).parent
 PASSED, FAILED, NOT_RUN = "passed", "FAILED", "not run"
 
 
@@ -47,7 +48,7 @@ def run_case(case: Case, full: bool) -> StressRow:
         measured, outcome = f"{type(error).__name__}: {error}", FAILED
     return StressRow(
         case.name, case.criterion, measured, outcome,
-        round(time.perf_counter() - wall, 1), round(sum(os.times()[:4]) - cpu, 1), instruction_set(), commit(),
+        round(time.perf_counter() - wall, 1), round(sum(os.times()[:4]) - cpu, 1), instruction_set(), commit_with(FOLDER),
     )  # fmt: skip
 
 
@@ -61,10 +62,10 @@ def run_cases(cases: Sequence[Case], full: bool, path: Path | None) -> list[Stre
         full: Whether at full size.
         path: Of the file; None runs all and writes nothing.
     """
-    header = provenance(None)
+    header = provenance(None, program="tests.stress")
     for each in ("isa", "commit", "seed"):  # a matter of the row, and of the cases
         del header[each]
-    known = _passed(path, commit(), instruction_set())
+    known = _passed(path, commit_with(FOLDER), instruction_set())
     done = {case.name: known[case.name] for case in cases if case.name in known}
     for case in sorted(cases, key=lambda c: c.minutes):
         if case.name in done:
@@ -98,7 +99,7 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
         if row.outcome == PASSED
         and row.isa == isa
         and isinstance(row.commit, str)
-        and same_code(row.commit, here)
+        and same_code_with(FOLDER, row.commit, here)
     }
 
 

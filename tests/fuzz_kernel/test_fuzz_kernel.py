@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import torch
 
+from tests import fuzz_kernel as fuzz
+from tests.fuzz_kernel import run_scene
+from tests.fuzz_kernel.layers import run_layers
+from tests.fuzz_kernel.scene import SWITCHES, FuzzScene, make_scene
 from vlgs import _csrc
-from vlgs.bench import fuzz
-from vlgs.bench.fuzz import run_scene
-from vlgs.bench.fuzz_layers import run_layers
-from vlgs.bench.fuzz_scene import SWITCHES, FuzzScene, make_scene
 from vlgs.types import ChannelGroup
 
 

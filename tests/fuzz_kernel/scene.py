@@ -1,4 +1,4 @@
-"""Hostile scenes for `vlgs.bench.fuzz`, each a function of its seed alone.
+"""Hostile scenes for `tests.fuzz_kernel`, each a function of its seed alone.
 
 Half of them are tame: every number is one that training can reach.
 """

@@ -1,0 +1,13 @@
+"""The terms of the loss, one class a file (Eqs. 8, 11 and 12).
+
+An objective says what it needs rendered of the two real views of an iteration, and returns its terms by name. It may render more, own
+modules that are trained along, and log numbers. ``conf/loss`` chooses the objectives of a run by name: a new one is one class and one
+YAML file.
+"""
+
+from vlgs.objectives.blended_view import BlendedView
+from vlgs.objectives.language import Language
+from vlgs.objectives.objective import Objective, Setup, StepView
+from vlgs.objectives.photometric import Photometric
+
+__all__ = ["BlendedView", "Language", "Objective", "Photometric", "Setup", "StepView"]

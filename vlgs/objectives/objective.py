@@ -1,0 +1,67 @@
+"""The interface of an objective, and what it sees of an iteration."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.blend import ViewBlend
+from vlgs.fields.splat import ViewRender
+from vlgs.objectives.targets import Target, TrainingViews
+from vlgs.skip_count import SkipCount
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What objectives are told before the first iteration."""
+
+    views: TrainingViews
+    objectives: Mapping[str, "Objective"]
+    """All of the run, by name."""
+    blend: ViewBlend
+    blend_least: float
+    """`vlgs.module.settings.SkipConfig.blend_weight`."""
+    blend_reuse: float
+    counts: SkipCount
+    """Where work that is left out is counted."""
+
+
+@dataclass(frozen=True)
+class StepView:
+    """One iteration as an objective sees it."""
+
+    step: int
+    pair: tuple[int, int]
+    """Which training views; equal where no two go together."""
+    targets: tuple[Target, Target]
+    """What they should look like."""
+    renders: tuple[ViewRender, ViewRender]
+    """What they look like, with the graph; what no objective needs is None."""
+    render: Callable[..., ViewRender]
+    """Render the Gaussians of this iteration from another camera; arguments as those of `SplatModel.render`."""
+    log: dict[str, float] = field(default_factory=dict)
+    """Numbers for callbacks, filled by the objectives."""
+
+
+class Objective(ABC):
+    """One part of the loss."""
+
+    needs: frozenset[str] = frozenset()
+    """What is rendered of the real views for it: ``color``, ``feature``, names of further attributes. A view without language has no
+    ``feature``."""
+    rate: float = 0.0
+    """Adam's, for the parameters of an objective that is a `torch.nn.Module`."""
+
+    def bind(self, setup: Setup) -> None:  # noqa: B027 (most need nothing)
+        """Look at the scene and at the other objectives, once, before the first iteration."""
+
+    @abstractmethod
+    def __call__(self, step: StepView) -> Mapping[str, Float[Tensor, ""]]:
+        """The terms of an iteration, weighted; empty where nothing counts. Names are free, their sum is minimised."""
+
+
+def all_needs(objectives: Sequence[Objective]) -> frozenset[str]:
+    """What several objectives need together."""
+    return frozenset().union(*(objective.needs for objective in objectives))
