@@ -167,7 +167,7 @@ def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
     geometry, weights = 3 + 4 + 3, 2  # means, quats, scales; opacity and indicator
     parameters = geometry + weights + 3 * (gaussians.sh_degree + 1) ** 2
     levels = len(LEVELS) if config.get("levels") == "joint" else 1
-    parameters += levels * OmegaConf.select(config, "codec.dim", default=512)
+    parameters += levels * OmegaConf.select(config, "head.dim", default=512)
     needed = gaussians.max_count * parameters * 4 * 4
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     line = f"training    {needed / 2**20:.0f} MiB for {gaussians.max_count} Gaussians at most, with their optimiser"

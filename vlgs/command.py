@@ -117,6 +117,8 @@ def _check_overrides(overrides: Sequence[Override], extra: Path | None, name: st
     }
     for override in overrides:
         key, said = override.key_or_group, override.input_line
+        if (now := renamed(key)) is not None:
+            raise ValueError(f"command: {key} must be given as {now}, its new name, got {said}")
         if override.type == OverrideType.DEL:
             raise ValueError(
                 f"command: keys must be given or left alone, got {said}, which takes {key} away"

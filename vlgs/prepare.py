@@ -130,7 +130,7 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
         OSError: Likewise.
         FloatingPointError: Likewise.
     """
-    from vlgs.codec.autoencoder import Autoencoder
+    from vlgs.heads.autoencoder import Autoencoder
     from vlgs.module.augment import NoAugment
     from vlgs.module.build import Parts
     from vlgs.module.fit import FitOptions
@@ -145,10 +145,10 @@ def rehearse(config: DictConfig, scenes: Scenes) -> None:
 
     def make_parts() -> Parts:
         parts = _make_parts(config)
-        codec, trainer = parts.codec, parts.trainer
-        if isinstance(codec, Autoencoder):
-            steps = min(_STEPS, codec.fit_settings.steps)
-            codec.fit_settings, codec.cache_dir = replace(codec.fit_settings, steps=steps), None
+        head, trainer = parts.head, parts.trainer
+        if isinstance(head, Autoencoder):
+            steps = min(_STEPS, head.fit_settings.steps)
+            head.fit_settings, head.cache_dir = replace(head.fit_settings, steps=steps), None
         return replace(parts, trainer=replace(trainer, iterations=min(_STEPS, trainer.iterations)))
 
     with TemporaryDirectory() as scratch:

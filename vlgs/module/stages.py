@@ -120,7 +120,7 @@ class Stages:
         folder, started = self.folder.part(name), time.perf_counter()
         parts = self.make_parts()
         start = {key: value.detach() for key, value in geometry.splats.items()}
-        start["features"] = torch.zeros(geometry.count, parts.codec.dim * scene.mask_levels)
+        start["features"] = torch.zeros(geometry.count, parts.head.dim * scene.mask_levels)
         module = build_module(scene, parts, self.seed, start=start)
         module.model.sh_degree = geometry.sh_degree
         lift_features(module)
