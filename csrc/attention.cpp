@@ -259,13 +259,11 @@ void read_block(const Attention<T> &a, int64_t begin, int64_t end, const Blocks<
 
 }  // namespace
 
-template <class T>
 int64_t attention_scratch(const AttentionShape &s) {
   T *const start = nullptr;
   return Blocks<T>(s, start).end - start;
 }
 
-template <class T>
 void attention(const Attention<T> &a, Fused<T *> out, int64_t begin, int64_t end, T *scratch) {
   const AttentionShape &s = a.shape;
   const Blocks<T> b(s, scratch);
@@ -291,7 +289,6 @@ void attention(const Attention<T> &a, Fused<T *> out, int64_t begin, int64_t end
   }
 }
 
-template <class T>
 void attention_backward(const Attention<T> &a, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
                         int64_t end, T *scratch, AttentionLayers<T *> sums) {
   const AttentionShape &s = a.shape;
@@ -331,10 +328,5 @@ void attention_backward(const Attention<T> &a, Fused<const T *> d_out, Fused<T *
     scatter(at(b.d_x, s.color, 0), s.feature, begin, end, d_in.feature);
   }
 }
-
-template int64_t attention_scratch<Number>(const AttentionShape &);
-template void attention(const Attention<Number> &, Fused<Number *>, int64_t, int64_t, Number *);
-template void attention_backward(const Attention<Number> &, Fused<const Number *>, Fused<Number *>, int64_t,
-                                 int64_t, Number *, AttentionLayers<Number *>);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -308,12 +308,10 @@ void blend_tile_backward(const Tile<T> &tile, T *slots) {
 
 }  // namespace
 
-template <class T>
 int64_t backward_scratch(const Pass<T> &p, int64_t list_length) {
   return list_length * kRecord + kBlocks * ((p.padded_channels + p.chains) * kLanes + state_size(p.chains));
 }
 
-template <class T>
 bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
   const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin;
   Carver<T> carver{scratch};
@@ -343,8 +341,5 @@ bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
   p.chains == 1 ? blend_tile_backward<T, 1>(tile, slots) : blend_tile_backward<T, 2>(tile, slots);
   return true;
 }
-
-template int64_t backward_scratch(const Pass<Number> &, int64_t);
-template bool blend_backward(const Pass<Number> &, int64_t, Number *, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -221,12 +221,10 @@ void blend_tile(const Tile<T> &tile) {
 
 }  // namespace
 
-template <class T>
 int64_t blend_scratch(const Pass<T> &p, int64_t list_length) {
   return list_length * kRecord + kMaxChains * kWeightsAhead * kLanes + p.channels * kLanes;
 }
 
-template <class T>
 void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
   const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin;
   Carver<T> carver{scratch};
@@ -239,8 +237,5 @@ void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
   else
     p.stop_before ? blend_tile<T, 2, true>(tile) : blend_tile<T, 2, false>(tile);
 }
-
-template int64_t blend_scratch(const Pass<Number> &, int64_t);
-template void blend(const Pass<Number> &, int64_t, Number *, uint32_t *);
 
 }  // namespace vlgs::VLGS_ISA_NS

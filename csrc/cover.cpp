@@ -88,7 +88,6 @@ inline double larger(double a, double b) { return a > b ? a : b; }
 }  // namespace
 
 // In double, and the same bits on every instruction set. Loops over kLanes become vector code.
-template <class T>
 void boxes(Grid grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs,
            Box *out) {
   const double width = double(grid.width), height = double(grid.height);
@@ -123,7 +122,6 @@ void boxes(Grid grid, int64_t count, const T *mean2d, const T *ellipse, T octave
   }
 }
 
-template <class T>
 void cover(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
   const Ellipse<T> e = ellipse(grid, record, cutoff, box);
   for (int32_t y = box.y0; y < box.y1; ++y) {
@@ -131,8 +129,5 @@ void cover(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
     for (int32_t x = box.x0; x < box.x1; ++x) *masks++ = mask_of(rows, (x - box.x0) * kColumns);
   }
 }
-
-template void boxes(Grid, int64_t, const Number *, const Number *, Number, const Number *, Box *);
-template void cover(Grid, const Number *, Number, Box, uint16_t *);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -46,7 +46,6 @@ inline void gather_channels(int64_t count, const uint32_t *entries, const uint32
 }  // namespace
 
 // The walk of the forward pass, front to back, up to the last contribution that it noted for each pixel.
-template <class T>
 void freeze(const Pass<T> &p, int64_t tile, int64_t *counts, uint32_t *ids, T *weights) {
   const int64_t begin = p.tile_begin[tile], length = p.tile_begin[tile + 1] - begin;
   const Pack<T> zero = splat(T(0));
@@ -75,7 +74,6 @@ void freeze(const Pass<T> &p, int64_t tile, int64_t *counts, uint32_t *ids, T *w
   }
 }
 
-template <class T>
 void frozen_blend(const Grid &grid, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
                   const T *values, int64_t channels, T *scratch, T *image) {
   int64_t k = 0;
@@ -94,7 +92,6 @@ void frozen_blend(const Grid &grid, int64_t block, int64_t count, const uint32_t
   }
 }
 
-template <class T>
 void frozen_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t channels, T *packs) {
   const Corner first = corner(grid, block);
   for (int l = 0; l < kLanes; ++l) {
@@ -105,7 +102,6 @@ void frozen_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t 
   }
 }
 
-template <class T>
 void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
                      const T *upstream, int64_t channels, T *d_value) {
   int64_t k = 0;
@@ -116,12 +112,5 @@ void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blo
   for (; k < channels; ++k)
     gather_channels<T, 1>(count, entries, blocks, weights, upstream + k * kLanes, channels, d_value + k);
 }
-
-template void freeze(const Pass<Number> &, int64_t, int64_t *, uint32_t *, Number *);
-template void frozen_blend(const Grid &, int64_t, int64_t, const uint32_t *, const Number *, const Number *,
-                           int64_t, Number *, Number *);
-template void frozen_upstream(const Grid &, int64_t, const Number *, int64_t, Number *);
-template void frozen_backward(int64_t, const uint32_t *, const uint32_t *, const Number *, const Number *,
-                              int64_t, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -3,28 +3,8 @@
 
 namespace vlgs::VLGS_ISA_NS {
 
-const Kernels<Number> kKernels = {project,
-                                  project_backward,
-                                  boxes,
-                                  cover,
-                                  blend_scratch,
-                                  backward_scratch,
-                                  blend,
-                                  blend_backward,
-                                  freeze,
-                                  frozen_blend,
-                                  frozen_upstream,
-                                  frozen_backward,
-                                  attention_scratch<Number>,
-                                  attention,
-                                  attention_backward,
-                                  multiply_add,
-                                  ssim_scratch,
-                                  ssim_map_rows,
-                                  ssim_sum_rows,
-                                  ssim_backward_scratch,
-                                  ssim_backward_rows,
-                                  squared_error_chunk,
-                                  squared_error_chunk_backward};
+#define VLGS_ENTRY(result, name, ...) name,
+const Kernels<Number> kKernels = {VLGS_KERNELS(VLGS_ENTRY)};
+#undef VLGS_ENTRY
 
 }  // namespace vlgs::VLGS_ISA_NS

@@ -1,6 +1,6 @@
-// What the kernels work on, and the list of them. They know arrays and nothing else: no Python, no threads,
-// no allocation. Every kernel is compiled once per instruction set for float, into that set's namespace, and
-// chosen at run time (dispatch.cpp); for double once, for any machine.
+// What the kernels work on, and the list of them (VLGS_KERNELS). They know arrays and nothing else: no
+// Python, no threads, no allocation. Every kernel is compiled once per instruction set for float, into that
+// set's namespace, and chosen at run time (dispatch.cpp); for double once, for any machine.
 //
 // Matrices are row by row. n Gaussians in the caller's order; m visible ones in the order of (depth, row),
 // "ranks".
@@ -163,48 +163,61 @@ enum Slot {
 };
 constexpr int kSlotHead = 8;  // where wide channels begin
 
+// The kernels: what one returns, its name, its arguments; T is float or double. This is the only list: the
+// table of an instruction set and the declarations (isa.h) are made of it, and a file defines each once.
+//
+// project, project_backward: rows [begin, end).
+// boxes: the tiles in which the pixel centres of `count` ellipses in a row may lie; empty, x0 >= x1, also
+// where
+//   the cutoff is negative. Inverse deviations are brought to octaves by a factor.
+// cover: block masks of one Gaussian over the tiles of a box, row by row.
+// blend, blend_backward: one tile; with scratch as large as its *_scratch says. Backward writes one slot per
+//   entry of the tile's list and says whether all it read was finite.
+// freeze: weights of the first chain of one tile: entries per block, and if `ids` is given the entries
+// themselves. frozen_blend: one block of pixels of an image; scratch [channels, kPixels]. frozen_upstream,
+// frozen_backward: a block of pixels as [channels, kPixels], then the gradient of one Gaussian's
+//   values over its entries.
+// attention, attention_backward: Gaussians [begin, end); backward adds to sums over them, one per lane.
+// multiply_add: a yardstick: `rounds` times kYardstick multiply-adds of 16 lanes, none of which waits for
+// another
+//   of its round.
+// ssim_*: rows [begin, end), all channels; with scratch as large as the *_scratch of its direction says.
+// squared_error_*: pixels [begin, end), few enough for sums in T.
+// clang-format off
+#define VLGS_KERNELS(KERNEL)                                                                                     \
+  KERNEL(void, project, const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end)                     \
+  KERNEL(void, project_backward, const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end)     \
+  KERNEL(void, boxes, Grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs, Box *) \
+  KERNEL(void, cover, Grid, const T *record, T cutoff, Box, uint16_t *masks)                                     \
+  KERNEL(int64_t, blend_scratch, const Pass<T> &, int64_t list_length)                                           \
+  KERNEL(int64_t, backward_scratch, const Pass<T> &, int64_t list_length)                                        \
+  KERNEL(void, blend, const Pass<T> &, int64_t tile, T *scratch, uint32_t *list)                                 \
+  KERNEL(bool, blend_backward, const Pass<T> &, int64_t tile, T *scratch, T *slots)                              \
+  KERNEL(void, freeze, const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights)                \
+  KERNEL(void, frozen_blend, const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,  \
+         const T *values, int64_t channels, T *scratch, T *image)                                                \
+  KERNEL(void, frozen_upstream, const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs)       \
+  KERNEL(void, frozen_backward, int64_t count, const uint32_t *entries, const uint32_t *blocks,                  \
+         const T *weights, const T *upstream, int64_t channels, T *d_value)                                      \
+  KERNEL(int64_t, attention_scratch, const AttentionShape &)                                                     \
+  KERNEL(void, attention, const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch)          \
+  KERNEL(void, attention_backward, const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin, \
+         int64_t end, T *scratch, AttentionLayers<T *> sums)                                                     \
+  KERNEL(T, multiply_add, int64_t rounds, T factor, T addend)                                                    \
+  KERNEL(int64_t, ssim_scratch, const Ssim<T> &)                                                                 \
+  KERNEL(void, ssim_map_rows, const Ssim<T> &, T *map, int64_t begin, int64_t end, T *scratch)                   \
+  KERNEL(void, ssim_sum_rows, const Ssim<T> &, SsimSums *of_rows, int64_t begin, int64_t end, T *scratch)        \
+  KERNEL(int64_t, ssim_backward_scratch, const Ssim<T> &)                                                        \
+  KERNEL(void, ssim_backward_rows, const Ssim<T> &, const SsimGrads<T> &, int64_t begin, int64_t end, T *scratch) \
+  KERNEL(ErrorSum, squared_error_chunk, const SquaredError<T> &, int64_t begin, int64_t end)                     \
+  KERNEL(void, squared_error_chunk_backward, const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end)
+// clang-format on
+
 template <class T>
 struct Kernels {
-  // Rows [begin, end).
-  void (*project)(const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end);
-  void (*project_backward)(const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end);
-  // The tiles in which the pixel centres of `count` ellipses in a row may lie; empty, x0 >= x1, also where
-  // the cutoff is negative. Inverse deviations are brought to octaves by a factor.
-  void (*boxes)(Grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs, Box *);
-  // Block masks of one Gaussian over the tiles of a box, row by row.
-  void (*cover)(Grid, const T *record, T cutoff, Box, uint16_t *masks);
-  // One tile; with scratch as large as its *_scratch says. Backward writes one slot per entry of the tile's
-  // list and says whether all it read was finite.
-  int64_t (*blend_scratch)(const Pass<T> &, int64_t list_length);
-  int64_t (*backward_scratch)(const Pass<T> &, int64_t list_length);
-  void (*blend)(const Pass<T> &, int64_t tile, T *scratch, uint32_t *list);
-  bool (*blend_backward)(const Pass<T> &, int64_t tile, T *scratch, T *slots);
-  // Weights of the first chain of one tile: entries per block, and if `ids` is given the entries themselves.
-  void (*freeze)(const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights);
-  // One block of pixels of an image; scratch [channels, kPixels].
-  void (*frozen_blend)(const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
-                       const T *values, int64_t channels, T *scratch, T *image);
-  // A block of pixels as [channels, kPixels], then the gradient of one Gaussian's values over its entries.
-  void (*frozen_upstream)(const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs);
-  void (*frozen_backward)(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
-                          const T *upstream, int64_t channels, T *d_value);
-  // Gaussians [begin, end); backward adds to sums over them, one per lane.
-  int64_t (*attention_scratch)(const AttentionShape &);
-  void (*attention)(const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch);
-  void (*attention_backward)(const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin,
-                             int64_t end, T *scratch, AttentionLayers<T *> sums);
-  // A yardstick: `rounds` times kYardstick multiply-adds of 16 lanes, none of which waits for another of its
-  // round.
-  T (*multiply_add)(int64_t rounds, T factor, T addend);
-  // Rows [begin, end), all channels; with scratch as large as the *_scratch of its direction says.
-  int64_t (*ssim_scratch)(const Ssim<T> &);
-  void (*ssim_map)(const Ssim<T> &, T *map, int64_t begin, int64_t end, T *scratch);
-  void (*ssim_sums)(const Ssim<T> &, SsimSums *of_rows, int64_t begin, int64_t end, T *scratch);
-  int64_t (*ssim_backward_scratch)(const Ssim<T> &);
-  void (*ssim_backward)(const Ssim<T> &, const SsimGrads<T> &, int64_t begin, int64_t end, T *scratch);
-  // Pixels [begin, end), few enough for sums in T.
-  ErrorSum (*squared_error)(const SquaredError<T> &, int64_t begin, int64_t end);
-  void (*squared_error_backward)(const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end);
+#define VLGS_POINTER(result, name, ...) result (*name)(__VA_ARGS__);
+  VLGS_KERNELS(VLGS_POINTER)
+#undef VLGS_POINTER
 };
 
 // The set in use: "v4" (AVX-512), "v3" (AVX2 and FMA) or "base"; VLGS_ISA lowers it.

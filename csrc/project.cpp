@@ -161,7 +161,6 @@ inline Input read_rows(const Gaussians<T> &g, int64_t first, int64_t end) {
 
 }  // namespace
 
-template <class T>
 void project(const Camera &c, Gaussians<T> g, Splats<T> out, int64_t begin, int64_t end) {
   for (int64_t first = begin; first < end; first += kChunk) {
     const Projection p = project_rows(c, read_rows(g, first, end));
@@ -184,7 +183,6 @@ void project(const Camera &c, Gaussians<T> g, Splats<T> out, int64_t begin, int6
   }
 }
 
-template <class T>
 void project_backward(const Camera &c, Gaussians<T> g, GaussianGrads<T> d, int64_t begin, int64_t end) {
   for (int64_t first = begin; first < end; first += kChunk) {
     Upstream up;
@@ -208,8 +206,5 @@ void project_backward(const Camera &c, Gaussians<T> g, GaussianGrads<T> d, int64
     }
   }
 }
-
-template void project(const Camera &, Gaussians<Number>, Splats<Number>, int64_t, int64_t);
-template void project_backward(const Camera &, Gaussians<Number>, GaussianGrads<Number>, int64_t, int64_t);
 
 }  // namespace vlgs::VLGS_ISA_NS

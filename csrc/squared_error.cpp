@@ -5,7 +5,6 @@
 #include "stretches.h"
 
 namespace vlgs::VLGS_ISA_NS {
-template <class T>
 ErrorSum squared_error_chunk(const SquaredError<T> &e, int64_t begin, int64_t end) {
   Pack<T> sums = splat(T(0));
   ErrorSum total = {0, 0};
@@ -29,7 +28,6 @@ ErrorSum squared_error_chunk(const SquaredError<T> &e, int64_t begin, int64_t en
   return total;
 }
 
-template <class T>
 void squared_error_chunk_backward(const SquaredError<T> &e, T scale, T *d_a, int64_t begin, int64_t end) {
   for_stretches(e.valid, begin, end, [&](int64_t first, int64_t last, bool counts) {
     const int64_t start = first * e.channels, stop = last * e.channels;
@@ -39,8 +37,5 @@ void squared_error_chunk_backward(const SquaredError<T> &e, T scale, T *d_a, int
       for (int64_t i = start; i < stop; ++i) d_a[i] = 0;
   });
 }
-
-template ErrorSum squared_error_chunk(const SquaredError<Number> &, int64_t, int64_t);
-template void squared_error_chunk_backward(const SquaredError<Number> &, Number, Number *, int64_t, int64_t);
 
 }  // namespace vlgs::VLGS_ISA_NS

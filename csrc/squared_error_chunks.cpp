@@ -30,7 +30,7 @@ ErrorSum squared_error(const SquaredError<T> &e, int threads) {
   const Buffer<ErrorSum> sums(chunks.count);
 #pragma omp parallel for num_threads(chunks.threads(threads))
   for (int64_t c = 0; c < chunks.count; ++c)
-    sums[c] = kernels<T>().squared_error(e, chunks.begin(c), chunks.end(c));
+    sums[c] = kernels<T>().squared_error_chunk(e, chunks.begin(c), chunks.end(c));
   ErrorSum total = {0, 0};
   for (int64_t c = 0; c < chunks.count; ++c) total.sum += sums[c].sum, total.pixels += sums[c].pixels;
   return total;
@@ -41,7 +41,7 @@ void squared_error_backward(const SquaredError<T> &e, T scale, T *d_a, int threa
   const Chunks<T> chunks{e};
 #pragma omp parallel for num_threads(chunks.threads(threads))
   for (int64_t c = 0; c < chunks.count; ++c)
-    kernels<T>().squared_error_backward(e, scale, d_a, chunks.begin(c), chunks.end(c));
+    kernels<T>().squared_error_chunk_backward(e, scale, d_a, chunks.begin(c), chunks.end(c));
 }
 
 template ErrorSum squared_error(const SquaredError<float> &, int);

@@ -210,12 +210,8 @@ void pick(const T *from, Step step, int64_t width, T *__restrict to) {
 
 }  // namespace
 
-template <class T>
-int64_t ssim_scratch(const Ssim<T> &s) {
-  return Stream<T>::scratch_size(s) + rounded(s.numbers());
-}
+int64_t ssim_scratch(const Ssim<T> &s) { return Stream<T>::scratch_size(s) + rounded(s.numbers()); }
 
-template <class T>
 void ssim_map_rows(const Ssim<T> &s, T *map, int64_t begin, int64_t end, T *scratch) {
   Stream<T> stream(s, begin, scratch);
   T *const row = scratch + Stream<T>::scratch_size(s);
@@ -235,7 +231,6 @@ void ssim_map_rows(const Ssim<T> &s, T *map, int64_t begin, int64_t end, T *scra
   }
 }
 
-template <class T>
 void ssim_sum_rows(const Ssim<T> &s, SsimSums *sums, int64_t begin, int64_t end, T *scratch) {
   Stream<T> stream(s, begin, scratch);
   T *const counts = scratch + Stream<T>::scratch_size(s);  // 1 or 0
@@ -256,7 +251,6 @@ void ssim_sum_rows(const Ssim<T> &s, SsimSums *sums, int64_t begin, int64_t end,
   }
 }
 
-template <class T>
 int64_t ssim_backward_scratch(const Ssim<T> &s) {
   return Stream<T>::scratch_size(s) + kSlopes * line_size(s) + (1 + kSlopes * kTaps) * rounded(s.numbers());
 }
@@ -269,7 +263,6 @@ int64_t ssim_backward_scratch(const Ssim<T> &s) {
 //   by Q:  Q (-4 structure (P^2 + floor) / (P^2 + Q^2 + floor)^2 - twice the one by QQ).
 // Those by PP and QQ come back through the window (its own transpose) and p and q, those by P and Q through
 // the window alone. The gradients by a and b are the sum and the difference of those by p and q.
-template <class T>
 void ssim_backward_rows(const Ssim<T> &s, const SsimGrads<T> &d, int64_t begin, int64_t end, T *scratch) {
   const int64_t first = begin < kHalf ? 0 : begin - kHalf, numbers = s.numbers();
   Stream<T> stream(s, first, scratch);
@@ -335,11 +328,5 @@ void ssim_backward_rows(const Ssim<T> &s, const SsimGrads<T> &d, int64_t begin, 
     });
   }
 }
-
-template int64_t ssim_scratch(const Ssim<Number> &);
-template void ssim_map_rows(const Ssim<Number> &, Number *, int64_t, int64_t, Number *);
-template void ssim_sum_rows(const Ssim<Number> &, SsimSums *, int64_t, int64_t, Number *);
-template int64_t ssim_backward_scratch(const Ssim<Number> &);
-template void ssim_backward_rows(const Ssim<Number> &, const SsimGrads<Number> &, int64_t, int64_t, Number *);
 
 }  // namespace vlgs::VLGS_ISA_NS

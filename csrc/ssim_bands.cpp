@@ -27,7 +27,7 @@ void for_bands(const Ssim<T> &s, int64_t scratch_size, int threads, Call call) {
 template <class T>
 void ssim_map(const Ssim<T> &s, T *map, int threads) {
   for_bands(s, kernels<T>().ssim_scratch(s), threads, [&](int64_t begin, int64_t end, T *scratch) {
-    kernels<T>().ssim_map(s, map, begin, end, scratch);
+    kernels<T>().ssim_map_rows(s, map, begin, end, scratch);
   });
 }
 
@@ -35,7 +35,7 @@ template <class T>
 SsimSums ssim_sums(const Ssim<T> &s, int threads) {
   const Buffer<SsimSums> rows(s.height);
   for_bands(s, kernels<T>().ssim_scratch(s), threads, [&](int64_t begin, int64_t end, T *scratch) {
-    kernels<T>().ssim_sums(s, rows.data(), begin, end, scratch);
+    kernels<T>().ssim_sum_rows(s, rows.data(), begin, end, scratch);
   });
   SsimSums total = {0, 0, 0};
   for (int64_t y = 0; y < s.height; ++y) {
@@ -49,7 +49,7 @@ SsimSums ssim_sums(const Ssim<T> &s, int threads) {
 template <class T>
 void ssim_backward(const Ssim<T> &s, const SsimGrads<T> &d, int threads) {
   for_bands(s, kernels<T>().ssim_backward_scratch(s), threads, [&](int64_t begin, int64_t end, T *scratch) {
-    kernels<T>().ssim_backward(s, d, begin, end, scratch);
+    kernels<T>().ssim_backward_rows(s, d, begin, end, scratch);
   });
 }
 

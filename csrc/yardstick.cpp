@@ -4,7 +4,6 @@
 
 namespace vlgs::VLGS_ISA_NS {
 
-template <class T>
 T multiply_add(int64_t rounds, T factor, T addend) {
   using Native = typename Pack<T>::Native;
   constexpr int kParts = Pack<T>::kParts;
@@ -18,7 +17,5 @@ T multiply_add(int64_t rounds, T factor, T addend) {
   for (const Native &sum : sums) total += sum;
   return total[0];
 }
-
-template Number multiply_add(int64_t, Number, Number);
 
 }  // namespace vlgs::VLGS_ISA_NS

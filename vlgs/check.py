@@ -7,22 +7,22 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import hydra
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from torch import Tensor
 
 from vlgs.arguments import take_command_line
 from vlgs.command import check_command
-from vlgs.config import CONF, LEVELS, check_config, instantiate
-from vlgs.data.colmap import survey
+from vlgs.config import CONF, check_config, instantiate
+from vlgs.data.colmap import load_scene, survey
 from vlgs.data.faults import Fault, SceneError, errors, listing, warning
 from vlgs.data.plausible import plausibility_warnings
 from vlgs.data.source import ColmapSource
+from vlgs.experiment import Experiment, construct
 from vlgs.prepare import doubts, prepare, rehearse
 from vlgs.text import screen
 from vlgs.types import IGNORE_ID, Scene, View
-
-_COLMAP = "vlgs.data.colmap.load_scene"
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,7 @@ def main(config: DictConfig) -> None:
     logging.getLogger("vlgs.data.colmap").setLevel(logging.ERROR)
     try:
         check_config(config)
-        report = check(config.data)
-        if not errors(report.faults):
-            line, doubts = training_memory(config)
-            faults = (*report.faults, *doubts, *start(config))
-            report = Report(faults, (*report.summary, line))
+        report = start(config, check(config.data))
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     print_report(report)
@@ -64,17 +60,22 @@ def command() -> None:
     main()
 
 
-def start(config: DictConfig) -> Iterator[Fault]:
-    """Begin the run for a few steps, so that an error at its start is found here."""
+def start(config: DictConfig, report: Report) -> Report:
+    """Construct what is configured and, if the scene can be used, begin the run for a few steps, so that an error at its start is found here."""
+    found, summary = list(report.faults), list(report.summary)
     try:
-        scenes = prepare(config).scenes
-        yield from doubts(config)
-        rehearse(config, scenes)
+        experiment = construct(config)
+        if not errors(report.faults):
+            line, doubtful = training_memory(experiment)
+            summary.append(line)
+            found += [*doubtful, *doubts(experiment)]
+            rehearse(prepare(experiment))
     except SceneError as error:
-        yield error.fault
+        found.append(error.fault)
     except (ValueError, OSError, FloatingPointError) as error:
         who, _, what = str(error).partition(": ")
-        yield Fault(who, what)
+        found.append(Fault(who, what))
+    return Report(tuple(found), tuple(summary))
 
 
 def check(data: DictConfig) -> Report:
@@ -87,7 +88,7 @@ def check(data: DictConfig) -> Report:
         FileNotFoundError: If there is no scene.
         ValueError: If an option is out of range.
     """
-    if data._target_ != _COLMAP:
+    if get_object(data._target_) is not load_scene:
         scene = instantiate(data)
         return Report(tuple(check_scene(scene)), tuple(summarize(scene)))
     options = OmegaConf.to_container(data, resolve=True, throw_on_missing=True)
@@ -158,16 +159,15 @@ def summarize(scene: Scene) -> Iterator[str]:
     yield f"memory      {decoded / 2**20:.0f} MiB for all photographs and masks, decoded"
 
 
-def training_memory(config: DictConfig) -> tuple[str, tuple[Fault, ...]]:
+def training_memory(experiment: Experiment) -> tuple[str, tuple[Fault, ...]]:
     """Memory that a run with this configuration may need for its Gaussians: a line of the summary, and a warning if it is too much.
 
     Value, gradient and Adam's two moments of every parameter at `gaussians.max_count`; images and activations come on top.
     """
-    gaussians = config.gaussians
+    gaussians, head = experiment.parts.gaussians, experiment.parts.head
     geometry, weights = 3 + 4 + 3, 2  # means, quats, scales; opacity and indicator
     parameters = geometry + weights + 3 * (gaussians.sh_degree + 1) ** 2
-    levels = len(LEVELS) if config.get("levels") == "joint" else 1
-    parameters += levels * OmegaConf.select(config, "head.dim", default=512)
+    parameters += experiment.levels.codes * head.dim
     needed = gaussians.max_count * parameters * 4 * 4
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     line = f"training    {needed / 2**20:.0f} MiB for {gaussians.max_count} Gaussians at most, with their optimiser"

@@ -27,16 +27,14 @@ OmegaConf.register_new_resolver(
 )
 """``${code_channels:${levels},${head.dim}}``: language channels of a Gaussian, which is what a fusion is built for."""
 
-_NO_FUSION = "vlgs.fusion.none.NoFusion"
-_PER_LEVEL = "vlgs.indicator.PerLevel"
-_NOT_LEARNED = ("vlgs.indicator.ColourOpacity", "vlgs.indicator.Fixed")
-
 MOST_THREADS = 256
 """Largest number of threads; no machine has more, and starting them would fail half-way."""
 
 
 def check_config(config: DictConfig) -> None:
-    """Refuse a configuration of `vlgs.run` that cannot work, before anything is read.
+    """Refuse a configuration of `vlgs.run` with keys, classes or values that cannot be, before anything is constructed.
+
+    What options ask of each other is checked by `vlgs.experiment.construct`.
 
     Raises:
         ValueError: Names the key, what it must be and what it is.
@@ -52,26 +50,6 @@ def check_config(config: DictConfig) -> None:
     if config.levels != "single" and "level" not in config.data:
         raise ValueError(
             f"config: data must have mask levels with levels={config.levels}, got no data.level"
-        )
-    if config.indicator._target_ == _PER_LEVEL and config.levels != "joint":
-        raise ValueError(
-            f"config: levels must be joint with indicator=per_level, got {config.levels}"
-        )
-    if config.sharing.get("lifted", False):
-        if "learning_rate" in config.head:
-            raise ValueError(
-                f"config: head must be fitted before training with sharing=lifted, as its codes are lifted, got {config.head._target_}"
-            )
-        for group, allowed in (("fusion", (_NO_FUSION,)), ("indicator", _NOT_LEARNED)):
-            if config[group]._target_ not in allowed:
-                raise ValueError(
-                    f"config: {group} must be {' or '.join(allowed)} with sharing=lifted, as nothing trains it, "
-                    f"got {config[group]._target_}"
-                )
-    if not config.sharing.get("means", True) and config.fusion._target_ != _NO_FUSION:
-        raise ValueError(
-            "config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, "
-            f"got {config.fusion._target_}"
         )
 
 
@@ -146,11 +124,17 @@ def _check_root(config: DictConfig) -> None:
     if not config.results:
         raise ValueError("config: results must be a folder, got ''")
     _require_place(config.results)
-    loggers = config.logger.get("loggers")
-    if not isinstance(loggers, ListConfig) or not all(
-        isinstance(one, DictConfig) and "_target_" in one for one in loggers
-    ):
-        raise ValueError(f"config: logger.loggers must be a list of loggers, got {loggers}")
+    for key in ("logger.loggers", "stages"):
+        parts, name = OmegaConf.select(config, key), last(key)
+        if not ((key == "stages" and parts is None) or _are_parts(parts)):
+            raise ValueError(f"config: {key} must be a list of {name}, got {parts}")
+
+
+def _are_parts(node: Any) -> bool:
+    """Whether a node is a list of things to construct."""
+    return isinstance(node, ListConfig) and all(
+        isinstance(one, DictConfig) and "_target_" in one for one in node
+    )
 
 
 def instantiate(config: Any, **arguments: Any) -> Any:

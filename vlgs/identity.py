@@ -65,6 +65,7 @@ GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
+    "stages": None,
     "trainer.exposure": False,
     "trainer.learning_rates.exposure": 1e-3,
 }

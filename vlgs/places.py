@@ -34,9 +34,9 @@ def record(config: DictConfig) -> dict[str, Any]:
     return content
 
 
-def write_config(path: Path, config: DictConfig) -> None:
-    """Write config.yaml."""
-    write_atomically(path, OmegaConf.to_yaml(OmegaConf.create(record(config))).encode())
+def write_config(path: Path, content: Mapping[str, Any]) -> None:
+    """Write config.yaml: what `record` returned."""
+    write_atomically(path, OmegaConf.to_yaml(OmegaConf.create(dict(content))).encode())
 
 
 def found_again(folder: Path) -> DictConfig:

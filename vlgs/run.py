@@ -2,13 +2,11 @@
 
 import logging
 import os
-import resource
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -17,13 +15,14 @@ from omegaconf import DictConfig
 
 from vlgs.arguments import command_line, take_command_line
 from vlgs.command import check_command
-from vlgs.config import CONF, instantiate
-from vlgs.identity import RESULTS_VERSION, identity
+from vlgs.config import CONF, check_config
 from vlgs.places import tidy_sweep, write_config
-from vlgs.prepare import Scenes, doubts, make_stages, prepare, text_encoder
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 from vlgs.tables.multirun import note_run
 from vlgs.text import screen
+
+if TYPE_CHECKING:
+    from vlgs.prepare import Prepared
 
 log = logging.getLogger(__name__)
 
@@ -88,15 +87,19 @@ def run(config: DictConfig) -> int:
     Returns:
         The exit status: 0 when the results are there, else `STOPPED` or `UNSCORED`.
     """
-    ready = prepare(config)
-    folder = RunFolder(Path(config.results) / "runs" / ready.run_id)
+    check_config(config)
+    from vlgs.experiment import construct
+    from vlgs.prepare import prepare
+
+    ready = prepare(construct(config))
+    folder = RunFolder(ready.experiment.results / "runs" / ready.run_id)
     note_run(folder.path)
-    if config.on_existing == "refuse" and folder.path.is_dir():
+    if ready.experiment.refuse_existing and folder.path.is_dir():
         raise FileExistsError(
             f"run: {folder.path} must not exist with on_existing=refuse; on_existing=resume goes on with it"
         )
     with folder.writing() as own, _removed_if_refused(folder):
-        return _run_in(own, config, ready.scenes)
+        return _run_in(own, ready)
 
 
 @contextmanager
@@ -117,26 +120,29 @@ def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
         raise
 
 
-def _run_in(folder: RunFolder, config: DictConfig, scenes: Scenes) -> int:
+def _run_in(folder: RunFolder, ready: "Prepared") -> int:
     finished = folder.finished()
     if finished is not None:
         return _say(finished, folder, "already done, nothing computed")
     from vlgs.data.plausible import plausibility_warnings
-    from vlgs.module.stages import StoppedError, train_all
+    from vlgs.finish import report
+    from vlgs.module.stages import run_stages
+    from vlgs.module.workshop import StoppedError
+    from vlgs.prepare import doubts, make_workshop, text_encoder
 
-    scene = next(reversed(scenes.values()))
-    for doubt in (*doubts(config), *plausibility_warnings(scene, (*scene.train, *scene.test))):
+    experiment, scene = ready.experiment, ready.scene
+    views = (*scene.train, *scene.test)
+    for doubt in (*doubts(experiment), *plausibility_warnings(scene, views)):
         log.warning("warning: %s", doubt)
-    text = text_encoder(config, scene)
-    write_config(folder.config, config)
-    stages = make_stages(folder, config, scenes)
+    text = text_encoder(experiment, scene)
+    write_config(folder.config, experiment.record)
+    workshop = make_workshop(folder, ready)
     try:
-        sharing, augment = instantiate(config.sharing), instantiate(config.augment)
-        field = train_all(stages, scenes, sharing, augment, joint=config.levels == "joint")
+        progress = run_stages(experiment.stages(), ready.scenes, workshop)
     except StoppedError as stop:
         log.warning("%s; the same command goes on from there:\n  %s", stop, _command())
         return STOPPED
-    return _say(_report(folder, config, scenes, field, stages, text), folder)
+    return _say(report(ready, progress, workshop, text), folder)
 
 
 def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
@@ -147,87 +153,10 @@ def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:
     return UNSCORED if metrics.get("failure") else 0
 
 
-def _report(
-    folder: RunFolder,
-    config: DictConfig,
-    scenes: Scenes,
-    field: Any,
-    stages: Any,
-    text: Any,
-) -> dict[str, Any]:
-    """Evaluate the trained scene and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished."""
-    from vlgs.fields.cloud import write_point_cloud
-    from vlgs.module.stages import all_skips
-    from vlgs.report.evaluate import evaluate
-    from vlgs.report.pictures import write_pictures
-    from vlgs.report.provenance import commit, machine
-    from vlgs.report.results import write_metrics, write_queries
-    from vlgs.report.timing import measure_fps
-    from vlgs.report.words import questions_of
-
-    scene = next(reversed(scenes.values()))
-    query, protocol = instantiate(config.query), instantiate(config.protocol)
-    done, kept = stages.done.values(), stages.kept
-    folder.require_own()
-    trained_on = [view.camera for view in scene.train]
-    written = [
-        stage.folder.ply
-        for stage in kept
-        if write_point_cloud(stage.folder.ply, stage.field, trained_on)
-    ]
-    evaluation = evaluate(field, scene, query, text, protocol)
-    asked = questions_of(field, scene, query, text)
-    prompts = asked.prompts if asked else None
-    if asked and asked.note:
-        query = asked.query
-        evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
-    if config.levels == "separate" and len(field.levels()) > 1:
-        first, *_, last = scenes
-        whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
-        evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
-    cameras, language = [v.camera for v in scene.test or scene.train], len(scene.mask_vectors) > 0
-    timing = measure_fps(field, cameras, query, prompts, language)
-    if config.pictures:
-        write_pictures(folder.renders, field, scene, query, prompts)
-    extra = {
-        "n_gaussians": sum(stage.model.count for stage in kept),
-        "levels": [level for level in scenes if level is not None]
-        if len(scene.mask_vectors)
-        else [],
-        "level_models": config.levels,
-        "train_seconds": sum(stage.seconds for stage in done),
-        "skips": all_skips(done).report(),
-        "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "ply_bytes": sum(path.stat().st_size for path in written) if written else None,
-        "checkpoint_bytes": sum(stage.checkpoint_bytes for stage in kept),
-        "seed": config.seed,
-        "config_hash": folder.path.name,
-        "recipe": identity(config).recipe,
-        "data_recipe": identity(config).data,
-        "dataset": _dataset(config),
-        "scene": scene.name,
-        "fingerprint": scene.fingerprint,
-        "results_version": RESULTS_VERSION,
-        "commit": commit(),
-        "machine": machine(),
-        **asdict(timing),
-    }
-    folder.require_own()
-    write_queries(folder.queries, evaluation)
-    return write_metrics(folder.metrics, evaluation, extra)
-
-
 def _places(folder: RunFolder) -> dict[str, Path]:
     """Files that the summary lists, as far as they exist."""
     places = {"run": folder.path, "pictures": folder.renders / "overview.png", "model": folder.ply}
     return {name: path for name, path in places.items() if path.exists()}
-
-
-def _dataset(config: DictConfig) -> str:
-    """The chosen option of conf/data; without a command line, the name of the module that reads the scene."""
-    if HydraConfig.initialized():
-        return str(HydraConfig.get().runtime.choices["data"])
-    return str(config.data._target_).split(".")[-2]
 
 
 def _command() -> str:

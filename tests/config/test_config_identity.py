@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from tiny_runs import composed
 
 from vlgs.identity import AS_WITHOUT, MOVES_NOTHING, PLACES, identity, moves, run_id
-from vlgs.known import CONF, groups, is_group, last, nodes, option, options, targets
+from vlgs.known import CONF, contents, groups, is_group, last, nodes, option, options, targets
 
 MOVING_NOTHING = (
     *("results", "progress", "pictures", "on_existing", "threads", "plugins", "logger.loggers"),
@@ -40,6 +40,7 @@ NAMES = {
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
+    "stages": "lift train train_color",
     "text": "clip vocabulary",
     "trainer": "base",
 }
@@ -65,7 +66,8 @@ written anew; else a change of one orphans every run that there is."""
 @pytest.fixture(scope="module")
 def every_option() -> list[DictConfig]:
     """Configurations that between them have every option of a run."""
-    chosen = {group: options(group) for group in groups() if group.partition("/")[0] != "features"}
+    chosen = {group: options(group) for group in groups() if "/" not in group}
+    del chosen["features"]
     chosen |= {"data": ["synthetic", "colmap"], "logger": ["csv"]}
     found = []
     for index in range(max(map(len, chosen.values()))):
@@ -76,6 +78,11 @@ def every_option() -> list[DictConfig]:
             picked += ["features.extractor.encoder.folder=maps"] * ("maps" in parts)
         picked += ["data.root=here"] if "data=colmap" in picked else []
         plain: Any = OmegaConf.to_container(composed(*picked), resolve=True)
+        if index == 0:
+            stages = [
+                CONF / "method" / "stages" / f"{name}.yaml" for name in options("method/stages")
+            ]
+            plain["stages"] = [contents(path) for path in stages]
         found.append(OmegaConf.create(plain))
     return found
 

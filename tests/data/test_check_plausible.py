@@ -12,6 +12,7 @@ from tiny_runs import composed
 
 from vlgs.check import check_scene, training_memory
 from vlgs.data.faults import errors
+from vlgs.experiment import construct
 from vlgs.types import Scene
 
 
@@ -130,10 +131,10 @@ def test_one_word_in_two_spellings_is_a_warning(tiny_scene: Scene):
 
 
 def test_memory_of_a_run_is_told_and_doubted():
-    line, found = training_memory(composed("gaussians.max_count=1000", "head.dim=3"))
+    line, found = training_memory(construct(composed("gaussians.max_count=1000", "head.dim=3")))
     assert line.startswith("training    1 MiB for 1000 Gaussians")  # 63 x 16 bytes each
     assert not found
-    _, found = training_memory(composed("gaussians.max_count=10000000000"))
+    _, found = training_memory(construct(composed("gaussians.max_count=1000000000")))
     assert "Gaussians should take at most half of the memory" in str(found[0])
 
 

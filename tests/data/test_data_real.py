@@ -1,4 +1,4 @@
-"""Real photographs, where they lie beside the checkout."""
+"""Photographs through a real lens: of a procedural scene, which stand in tests/fixtures, and real ones, where they lie beside the checkout."""
 
 from pathlib import Path
 
@@ -14,38 +14,47 @@ from vlgs.data.labels.objects import LabelledImage
 from vlgs.data.source import ColmapSource
 
 SHARED = Path(__file__).parents[2] / "../shared/data"
+OURS = Path(__file__).parents[1] / "fixtures" / "photographs"
 needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason="no real data beside the checkout")
 
 
-@needs_data
 @pytest.mark.parametrize(
-    ("name", "views", "points", "size"),
+    ("root", "views", "points", "size"),
     [
-        ("dtu_scan65", (42, 7), 3513, (800, 600)),
-        ("camvid_0016E5", (88, 13), 3897, (492, 364)),
-        ("fox", (43, 7), 10900, (530, 946)),
+        (OURS, (7, 2), 283, (97, 72)),
+        pytest.param(SHARED / "dtu_scan65", (42, 7), 3513, (800, 600), marks=needs_data),
+        pytest.param(SHARED / "camvid_0016E5", (88, 13), 3897, (492, 364), marks=needs_data),
+        pytest.param(SHARED / "fox", (43, 7), 10900, (530, 946), marks=needs_data),
     ],
 )
-def test_scenes_load(name: str, views: tuple[int, int], points: int, size: tuple[int, int]):
-    scene = load_scene(str(SHARED / name))
+def test_scenes_load(root: Path, views: tuple[int, int], points: int, size: tuple[int, int]):
+    scene = load_scene(str(root))
     assert (len(scene.train), len(scene.test), len(scene.points)) == (*views, points)
     assert {(v.camera.width, v.camera.height) for v in scene.train} == {size}
 
 
-@needs_data
-def test_labelled_streets_are_sound():
-    scene = load_scene(str(SHARED / "camvid_0016E5"), split="all")
-    assert len(scene.classes) == 11
-    assert len(scene.train) == len(scene.test) == 101
+@pytest.mark.parametrize(
+    ("root", "classes", "views"),
+    [
+        (OURS, 12, 9),
+        pytest.param(SHARED / "camvid_0016E5", 11, 101, marks=needs_data),
+    ],
+)
+def test_labelled_photographs_are_sound(root: Path, classes: int, views: int):
+    scene = load_scene(str(root), split="all")
+    assert len(scene.classes) == classes
+    assert len(scene.train) == len(scene.test) == views
     assert not errors(check_scene(scene))
 
 
-@needs_data
-def test_points_project_onto_pixels_of_their_brightness():
+@pytest.mark.parametrize(
+    ("root", "every"), [(OURS, 1), pytest.param(SHARED / "fox", 7, marks=needs_data)]
+)
+def test_points_project_onto_pixels_of_their_brightness(root: Path, every: int):
     """Two pixels off is worse: so axes, order, principal point and undistortion are right to about a pixel."""
-    scene = load_scene(str(SHARED / "fox"))
+    scene = load_scene(str(root))
     margin = 4
-    for view in scene.train[::7]:
+    for view in scene.train[::every]:
         image = view.read_image().float().mean(dim=2)
         camera = scene.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
         xy = ((camera @ view.camera.K.T)[:, :2] / camera[:, 2:]).floor().long()

@@ -1,6 +1,7 @@
 """transforms.json and poses_bounds.npy are the scenes that they were made from."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,18 @@ def test_llff_poses_are_the_scene(tmp_path: Path):
         SceneError, match=r"finite floats \[9, 17\], a row for each image, got .*\[8, 17\]"
     ):
         load_scene(str(tmp_path))
+
+
+def test_photographs_of_half_the_size_that_a_distorted_lens_is_written_for(tmp_path: Path):
+    root = Path(__file__).parents[1] / "fixtures" / "photographs"
+    shutil.copytree(root / "images", tmp_path / "images")
+    shutil.copy(root / "transforms.json", tmp_path)
+    scene, colmaps = load_scene(str(tmp_path)), load_scene(str(root))
+    assert len(scene.points) == 0
+    for ours, theirs in zip(scene.train, colmaps.train, strict=True):
+        torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(ours.camera.K, theirs.camera.K)
+        assert torch.equal(ours.read_image(), theirs.read_image())
 
 
 def test_the_fox_of_instant_ngp(shared: Path, tmp_path: Path):

@@ -74,9 +74,14 @@ def test_neighbours_match_brute_force(kind: str, n: int, k: int, seed: int):
     )
 
 
-@pytest.mark.skipif(not GARDEN.exists(), reason="real points not at hand")
-def test_neighbours_of_real_points():
-    points = torch.from_numpy(np.load(GARDEN)["means3d"][::60].copy()).float()
+@pytest.mark.parametrize("source", ["procedural", "garden"])
+def test_neighbours_of_a_scenes_points(source: str, tiny_scene: Scene):
+    if source == "procedural":
+        points = tiny_scene.points
+    elif GARDEN.exists():
+        points = torch.from_numpy(np.load(GARDEN)["means3d"][::60].copy()).float()
+    else:
+        pytest.skip("real points not at hand")
     torch.testing.assert_close(
         mean_squared_distance(points), brute_force(points, 3), rtol=1e-5, atol=0
     )

@@ -13,6 +13,7 @@ from vlgs.gaussians import STANDARD, activate, read_ply, write_ply
 PARAMETERS = tuple(STANDARD)[:8]
 """What every training has."""
 
+OURS = Path(__file__).parents[1] / "fixtures" / "gaussians.ply"
 REAL = Path(__file__).parents[2] / "../shared/data/splats/kacytran_it7000.ply"
 
 
@@ -83,15 +84,17 @@ def test_order_of_properties_does_not_matter_and_language_may_be_missing(tmp_pat
     assert torch.equal(back["features"], torch.zeros(4, 5))
 
 
-@pytest.mark.skipif(not REAL.exists(), reason="real Gaussians not at hand")
-def test_real_file_comes_in_and_out(tmp_path: Path):
-    params = read_ply(REAL)
+@pytest.mark.parametrize(("path", "count"), [(OURS, 120), (REAL, 9080)])
+def test_a_file_of_3dgs_comes_in_and_out(tmp_path: Path, path: Path, count: int):
+    if not path.exists():
+        pytest.skip("real Gaussians not at hand")
+    params = read_ply(path)
     gaussians = activate(params)
-    assert gaussians.shN.shape == (9080, 15, 3)
+    assert gaussians.shN.shape == (count, 15, 3)
     assert gaussians.scales.isfinite().all()
     write_ply(tmp_path / "out.ply", params)
     ours = PlyData.read(str(tmp_path / "out.ply"), mmap="c")["vertex"].data
-    theirs = PlyData.read(str(REAL), mmap="c")["vertex"].data
+    theirs = PlyData.read(str(path), mmap="c")["vertex"].data
     for name in theirs.dtype.names:
         np.testing.assert_array_equal(ours[name], theirs[name])
 

@@ -8,6 +8,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.data.synthetic.language import vocabulary
 from vlgs.heads import Head
 from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
 
@@ -51,11 +52,28 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-@pytest.fixture(scope="module")
-def camvid() -> tuple[Autoencoder, Tensor]:
-    if not CITYSCAPES.exists():
+@pytest.fixture(scope="module", params=["procedural", "real"])
+def camvid(request: pytest.FixtureRequest) -> tuple[Autoencoder, Tensor]:
+    """A head, and the vectors of the eleven classes of a street that it was fitted to."""
+    if request.param == "procedural":
+        words = (
+            "sky",
+            "building",
+            "pole",
+            "road",
+            "pavement",
+            "tree",
+            "sign",
+            "fence",
+            "car",
+            "pedestrian",
+            "bicyclist",
+        )
+        classes = vocabulary(words).vectors[:11]
+    elif CITYSCAPES.exists():
+        classes = normalize(torch.from_numpy(np.load(CITYSCAPES)[CAMVID].astype(np.float32)))
+    else:
         pytest.skip("real text embeddings not at hand")
-    classes = normalize(torch.from_numpy(np.load(CITYSCAPES)[CAMVID].astype(np.float32)))
     head = Autoencoder()
     vectors, areas, _ = masks(classes, 60, seed=2)
     head.fit(vectors, areas)

@@ -312,9 +312,21 @@ def test_broken_rows_are_counted_and_refused_or_dropped(tmp_path: Path):
         read_gaussians(tmp_path / "b.splat")
 
 
-@pytest.mark.parametrize("name", ["juleelee_model.splat", "kacytran_it7000.ply"])
-def test_real_files_go_through_every_format(shared: Path, tmp_path: Path, name: str):
-    source = shared / "data" / "splats" / name
+OURS = Path(__file__).parents[1] / "fixtures"
+REAL = Path(__file__).parents[3] / "shared" / "data" / "splats"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        *(OURS / "gaussians.splat", OURS / "gaussians.ply"),
+        *(REAL / "juleelee_model.splat", REAL / "kacytran_it7000.ply"),
+    ],
+    ids=lambda path: path.name,
+)
+def test_files_of_other_programs_go_through_every_format(tmp_path: Path, source: Path):
+    if not source.exists():
+        pytest.skip("needs the real data beside the checkout")
     read = read_gaussians(source, drop=True)
     for target in ("3dgs-ply", "3dgs", "splat"):
         path = tmp_path / f"a{FORMATS[target][0]}"

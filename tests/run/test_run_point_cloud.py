@@ -11,14 +11,17 @@ import torch
 from tiny_runs import TINY, composed
 from viewer_3dgs import C0, Pinhole, draw_color, draw_language, read_columns, read_rows
 
+import vlgs.prepare
 import vlgs.run
 from vlgs.config import CONF, instantiate
 from vlgs.convert import convert
+from vlgs.fields.splat import SplatModel
+from vlgs.fields.trained import SplatField
 from vlgs.gaussians import read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN, read_notes
 from vlgs.interchange import read_gaussians
 from vlgs.module.build import Parts, build_module
-from vlgs.module.stages import Stage, Stages
+from vlgs.module.workshop import Made, Workshop
 from vlgs.runs import RunFolder
 from vlgs.types import Camera, Scene
 
@@ -61,20 +64,20 @@ class Done:
     """A run: its folder, the models in it and what it says of itself."""
 
     folder: RunFolder
-    stages: list[Stage]
+    stages: list[Made]
     psnr: float
 
 
 @pytest.fixture
 def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
-    kept: list[Stages] = []
-    original = vlgs.run.make_stages
+    kept: list[Workshop] = []
+    original = vlgs.prepare.make_workshop
 
-    def keeping(*arguments: object) -> Stages:
+    def keeping(*arguments: object) -> Workshop:
         kept.append(original(*arguments))  # type: ignore[arg-type]
         return kept[-1]
 
-    monkeypatch.setattr(vlgs.run, "make_stages", keeping)
+    monkeypatch.setattr(vlgs.prepare, "make_workshop", keeping)
 
     def go(*overrides: str) -> Done:
         assert vlgs.run.run(composed(*SHORT, *overrides, f"results={tmp_path}")) == 0
@@ -83,6 +86,15 @@ def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
         return Done(RunFolder(path), kept[0].kept, metrics["psnr"])
 
     return go
+
+
+def model_of(made: Made) -> SplatModel:
+    assert isinstance(made.field, SplatField)
+    return made.field.model
+
+
+def has_color(made: Made) -> bool:
+    return "color" in made.field.outputs
 
 
 def pinhole(camera: Camera) -> Pinhole:
@@ -101,11 +113,11 @@ def psnr(columns: dict[str, np.ndarray], scene: Scene) -> float:
 
 
 @torch.no_grad()
-def language_error(stage: Stage, camera: Camera) -> float:
+def language_error(stage: Made, camera: Camera) -> float:
     """Largest difference between the model's language map and the file's, as a share of the map's largest value."""
-    expected = stage.model.render(camera, color=False).feature
+    expected = model_of(stage).render(camera, color=False).feature
     assert expected is not None
-    drawn = draw_language(read_columns(stage.folder.ply), pinhole(camera), stage.model.levels)
+    drawn = draw_language(read_columns(stage.folder.ply), pinhole(camera), model_of(stage).levels)
     return float(np.abs(drawn - expected.numpy()).max() / expected.abs().max().clamp_min(1e-9))
 
 
@@ -127,20 +139,20 @@ def needed(*options: str) -> list[str]:
 
 
 def judge(done: Done, scene: Scene, fitted: bool) -> None:
-    colored = [stage for stage in done.stages if stage.color]
+    colored = [stage for stage in done.stages if has_color(stage)]
     # The run's figure is that of the first mask level; every level has a file, and must look like its own model.
     assert psnr(read_columns(colored[0].folder.ply), scene) == pytest.approx(done.psnr, abs=0.05)
     camera = scene.test[0].camera
     for stage in done.stages:
         assert read_notes(stage.folder.ply)[0] == PLAIN
         with torch.no_grad():
-            expected = stage.model.render(camera).color
+            expected = model_of(stage).render(camera).color
         assert expected is not None
         difference = np.abs(
             shown(read_columns(stage.folder.ply), camera) - expected.numpy().clip(0, 1)
         )
         # Measured 0.04 with fitted harmonics; else 1e-6, or what lies behind the last 1e-2 of light with raster=fast.
-        assert difference.max() < (0.1 if fitted else 0.01) or not stage.color
+        assert difference.max() < (0.1 if fitted else 0.01) or not has_color(stage)
         # Language that depends on the view has no place in a file: its mean is written. Else measured 2e-4, or 6e-3 where
         # every weight is 1 and all hangs on whether the splat that ends a pixel still counts.
         assert language_error(stage, camera) < (0.3 if fitted else 0.01)
@@ -152,7 +164,7 @@ def test_raw_parameters_would_show_another_picture(
     """What the tests above would not notice if fusion had hardly moved; also every way out of the run's folder."""
     done = go("fusion=self", "gaussians.color=rgb")
     (stage,) = done.stages
-    write_ply(tmp_path / "raw.ply", stage.model.splats)
+    write_ply(tmp_path / "raw.ply", model_of(stage).splats)
     assert psnr(read_columns(tmp_path / "raw.ply"), tiny_scene) < done.psnr - 1  # measured -2.3
 
     lines = convert(done.folder.path, tmp_path / "a.splat")
@@ -187,10 +199,10 @@ def test_a_run_that_starts_from_the_file_starts_with_its_picture(
     config = composed(*SHORT, f"fusion={fusion}", f"gaussians.init={done.folder.ply}")
     parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
     model = build_module(tiny_scene, parts, 0).model
-    model.sh_degree = done.stages[0].model.sh_degree
+    model.sh_degree = model_of(done.stages[0]).sh_degree
     camera = tiny_scene.test[0].camera
     with torch.no_grad():
-        started, finished = model.render(camera), done.stages[0].model.render(camera)
+        started, finished = model.render(camera), model_of(done.stages[0]).render(camera)
     torch.testing.assert_close(started.color, finished.color, rtol=0, atol=1e-5)
     torch.testing.assert_close(started.feature, finished.feature, rtol=0, atol=1e-5)
 
@@ -201,7 +213,7 @@ def test_a_run_of_several_models_is_converted_by_its_folder(
     done = go("sharing=none", "fusion=none")
     first, second, *_ = convert(done.folder.path, tmp_path / "a.splat")
     assert first == "from color/point_cloud.ply; the run also has language/point_cloud.ply"
-    count = done.stages[0].model.count
+    count = model_of(done.stages[0]).count
     assert f"{count} Gaussians" in second
     done.folder.ply.with_name("color").joinpath("point_cloud.ply").unlink()
     with pytest.raises(FileNotFoundError, match=r"must have a point_cloud\.ply, got none"):

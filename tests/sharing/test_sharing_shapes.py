@@ -12,7 +12,6 @@ from vlgs.config import instantiate
 from vlgs.gaussians import (
     DensifyState,
     GaussiansConfig,
-    Sharing,
     attributes_of,
     conform,
     densify,
@@ -22,6 +21,7 @@ from vlgs.gaussians import (
 from vlgs.module.build import Parts, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
+from vlgs.module.sharing import choose_sharing
 from vlgs.runs import RunFolder
 from vlgs.types import Camera, Scene, Shape
 
@@ -240,4 +240,4 @@ def test_kept_weights_are_those_of_both_shapes(tiny_scene: Scene, frozen: bool):
 
 def test_what_is_not_shared_by_position_is_not_shared_by_shape():
     with pytest.raises(ValueError, match="covariances must be false where means is false"):
-        Sharing(means=False, covariances=True)
+        choose_sharing(means=False, covariances=True)

@@ -1,12 +1,15 @@
 """Finished runs without training: what the rows of tables would leave."""
 
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from vlgs.identity import RESULTS_VERSION
 from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.fill import Cell, Filled, Place, fill
+from vlgs.tables.frame import read_metrics, tidy, to_lines
 from vlgs.tables.registry import Row, Table
 
 KINDS = {"cup": "translucent_reflective", "pot": "translucent_reflective", "big wall": "other"}
@@ -72,3 +75,52 @@ def fake_runs(
                     )
     composer.save()
     return len(names)
+
+
+BENCHMARK = Benchmark("synthetic", ("data=synthetic",), ("glassware", "mirrors"), (0, 1))
+
+
+TABLE = """
+label: tiny
+caption: "50% of sake_cup & {more} #1 $x^2 ~ \\\\"
+dataset: lerf_ovs
+scenes: {ramen: ramen}
+metrics: [miou, psnr]
+rows:
+  - {label: Without_it, group: "A: one & all", set: [fusion=none], marks: {position: true, covariance: false}, paper: {avg: 40.0}}
+  - {label: Full, group: "A: one & all", set: [], marks: {position: true, covariance: true}, paper: {avg: 50.0}}
+  - {label: Opacity, group: "B: other", set: [indicator=opacity], paper: {avg: 45.0}}
+  - {label: Someone, group: "B: other", method: someone, paper: {avg: 41.0}}
+"""
+
+
+def value(row: Row, scene: str, seed: int) -> float:
+    base = {"Without_it": 0.4, "Full": 0.5, "Opacity": 0.45}[row.label]
+    return base + (0.1 if scene == "mirrors" else 0.0) + 0.02 * seed
+
+
+def filled_of(table: Table, results: Path, benchmark: Benchmark = BENCHMARK) -> Filled:
+    return fill(table, benchmark, Composer(benchmark), tidy(to_lines(read_metrics(results))))
+
+
+def cell(filled: Filled, row: int, column: str, metric: str = "miou") -> Cell:
+    return filled.cells[Place(row, column, metric)]
+
+
+def balanced(text: str) -> None:
+    """Environments close in order, braces balance, and every row of a tabular has its columns."""
+    open_ones: list[str] = []
+    for begin, name in re.findall(r"\\(begin|end)\{(\w+)\}", text):
+        if begin == "begin":
+            open_ones.append(name)
+        else:
+            assert open_ones.pop() == name
+    assert not open_ones
+    plain = text.replace(r"\{", "").replace(r"\}", "")
+    assert plain.count("{") == plain.count("}")
+    spec = re.search(r"\\begin\{tabular\}\{(\w+)\}", text)
+    assert spec is not None
+    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert len(rows) > 1
+    for row in rows:
+        assert row.replace(r"\&", "").count("&") == len(spec.group(1)) - 1, row

@@ -3,7 +3,8 @@
 import itertools
 import statistics
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -96,3 +97,18 @@ def take_turns(
             if round_ >= warm_up:
                 samples[key].append(sample)
     return samples
+
+
+@contextmanager
+def replaced(owner: object, name: str, value: object) -> Iterator[None]:
+    """Put something else in the place of an attribute of an object or a class, for as long as the context lasts."""
+    own = vars(owner)
+    there, before = name in own, own.get(name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        if there:
+            setattr(owner, name, before)
+        else:  # of its class
+            delattr(owner, name)

@@ -3,18 +3,18 @@
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from contextlib import ExitStack
+from dataclasses import dataclass
 from inspect import getattr_static
 from statistics import fmean
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 from rich.table import Table
 
-from vlgs.config import CONF, instantiate
-from vlgs.module.build import Parts, build_module
+from vlgs.bench.clock import replaced
+from vlgs.bench.presets import build, composed
+from vlgs.experiment import construct
 from vlgs.module.lightning import VLGSModule
 from vlgs.objectives import BlendedView
 from vlgs.ops import attention, blend, project, view_color
@@ -88,7 +88,7 @@ def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
         for owner, name, part in _timed(module):
             call = watch.around(part, getattr(owner, name))
             static = isinstance(getattr_static(owner, name), staticmethod)
-            patches.enter_context(_replaced(owner, name, staticmethod(call) if static else call))
+            patches.enter_context(replaced(owner, name, staticmethod(call) if static else call))
         first = size.sh_degree * module.settings.sh_every
         statistics = watch.around("densification statistics", _gather_statistics)
         step = watch.around("step, what is left", module.training_step)
@@ -125,21 +125,6 @@ def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
     yield module.model, "fuse", "activation, forward"
     yield module.model, "view_color", "spherical harmonics"
     yield module.model, "render", "render, what is left"
-
-
-@contextmanager
-def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Another attribute for a while; whether the owner has one of its own or that of its class is as before afterwards."""
-    own = name in vars(owner)
-    before = vars(owner).get(name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        if own:
-            setattr(owner, name, before)
-        else:
-            delattr(owner, name)
 
 
 def _gather_statistics(module: VLGSModule) -> None:
@@ -184,7 +169,5 @@ def _module(size: IterationSize) -> VLGSModule:
         f"data.height={size.height}",
         f"data.points={size.gaussians}",
     ]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=overrides)
-    parts = Parts(**{part.name: instantiate(config[part.name]) for part in fields(Parts)})
-    return build_module(instantiate(config.data), parts, config.seed)
+    experiment = construct(composed(overrides))
+    return build(experiment, experiment.read_scene())

@@ -2,14 +2,12 @@
 
 import tempfile
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from hydra import compose, initialize_config_dir
-
-from vlgs.config import CONF, instantiate
-from vlgs.module.build import Parts, build_module
+from vlgs.bench.presets import build, composed
+from vlgs.experiment import construct
 from vlgs.module.fit import FitOptions, fit
 from vlgs.runs import RunFolder
 
@@ -35,10 +33,8 @@ class Overhead:
 
 def measure_overhead(iterations: int) -> Overhead:
     """Train the default model for some iterations and time what lies between its steps."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=[*OVERRIDES, f"trainer.iterations={iterations}"])
-    parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
-    module = build_module(instantiate(config.data), parts, config.seed)
+    experiment = construct(composed([*OVERRIDES, f"trainer.iterations={iterations}"]))
+    module = build(experiment, experiment.read_scene())
     starts, ends = [], []
     step = module.training_step
 

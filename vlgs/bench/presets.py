@@ -1,32 +1,30 @@
 """The configuration as benchmarks need it: raster presets, training runs, a trained scene."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vlgs.config import CONF, check_config, check_targets, instantiate
-from vlgs.identity import run_id
+from vlgs.experiment import Experiment, construct
 from vlgs.known import options
-from vlgs.module.build import Parts, build_module
+from vlgs.module.build import build_module
 from vlgs.module.checkpoint import load_checkpoint
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.lightning import VLGSModule
 from vlgs.module.state import restore
-from vlgs.places import found_again, record, write_config
+from vlgs.places import found_again, write_config
 from vlgs.runs import RunFolder
 from vlgs.types import RasterConfig, Scene
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained scene and the configuration it was trained with."""
+    """A trained scene and what its training was told."""
 
-    config: DictConfig
+    experiment: Experiment
     scene: Scene
     module: VLGSModule
 
@@ -49,38 +47,33 @@ def raster_presets() -> dict[str, RasterConfig]:
     return dict(sorted(found.items(), key=lambda item: item[1].transmittance_min))
 
 
-def build(config: DictConfig, scene: Scene) -> VLGSModule:
+def build(experiment: Experiment, scene: Scene) -> VLGSModule:
     """The module that `python -m vlgs.run` would train."""
-    torch.manual_seed(config.seed)
-    parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
-    return build_module(scene, parts, config.seed)
+    return build_module(scene, experiment.make_parts(), experiment.seed)
 
 
 def train_or_load(overrides: Sequence[str], results: Path) -> Trained:
     """A trained scene; it shares its folder with `python -m vlgs.run`, so that what is trained is not trained again."""
-    config = composed([*overrides, f"results={results}"])
-    scene = instantiate(config.data)
-    module = build(config, scene)
-    meta = {
-        "config": record(config),
-        "fingerprint": scene.fingerprint,
-    }
-    folder = RunFolder(results / "runs" / run_id(config, scene.fingerprint))
+    experiment = construct(composed([*overrides, f"results={results}"]))
+    scene = experiment.read_scene()
+    module = build(experiment, scene)
+    meta = {"config": experiment.record, "fingerprint": scene.fingerprint}
+    folder = RunFolder(results / "runs" / experiment.run_id(scene.fingerprint))
     with folder.writing() as own:
-        write_config(own.config, config)
+        write_config(own.config, experiment.record)
         if fit(module, own, FitOptions(meta)) is not None:
             raise KeyboardInterrupt
-    return Trained(config, scene, module)
+    return Trained(experiment, scene, module)
 
 
 def train_a_little(overrides: Sequence[str], steps: int = 25) -> Trained:
     """A scene after its first iterations, without densification; nothing is written."""
-    config = composed(overrides)
-    scene = instantiate(config.data)
-    module = build(config, scene)
+    experiment = construct(composed(overrides))
+    scene = experiment.read_scene()
+    module = build(experiment, scene)
     for step in range(steps):
         module.training_step(step, step)
-    return Trained(config, scene, module)
+    return Trained(experiment, scene, module)
 
 
 def load_run(path: Path) -> Trained:
@@ -95,9 +88,10 @@ def load_run(path: Path) -> Trained:
         raise ValueError(f"bench: {path} must be a run folder with a checkpoint, got none")
     config = found_again(path.resolve())
     check_targets(config, plugins=())  # a file's word is nobody's trust
-    scene: Any = instantiate(config.data)
+    experiment = construct(config)
+    scene = experiment.read_scene()
     if scene.fingerprint != checkpoint.meta.get("fingerprint"):
         raise ValueError(f"bench: data of {path} must be those of its training, got others")
-    module = build(config, scene)
+    module = build(experiment, scene)
     restore(module, checkpoint)
-    return Trained(config, scene, module)
+    return Trained(experiment, scene, module)

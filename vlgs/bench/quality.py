@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import torch
 
 from vlgs.bench.presets import Trained
-from vlgs.config import instantiate
 from vlgs.fields.trained import SplatField
 from vlgs.report.evaluate import Evaluation, evaluate
 from vlgs.types import RasterConfig
@@ -26,18 +25,13 @@ class Quality:
 
 def score(trained: Trained) -> Evaluation:
     """The evaluation that ends `python -m vlgs.run`, without its pictures."""
-    config, scene = trained.config, trained.scene
+    experiment, scene = trained.experiment, trained.scene
     text = None
     if scene.classes and scene.mask_vectors.shape[0] > 0 and scene.vocabulary is not None:
-        text = instantiate(config.text)(vocabulary=scene.vocabulary)
+        text = experiment.make_text(vocabulary=scene.vocabulary)
     with torch.no_grad():
-        return evaluate(
-            SplatField(trained.module.model),
-            scene,
-            instantiate(config.query),
-            text,
-            instantiate(config.protocol),
-        )
+        field = SplatField(trained.module.model)
+        return evaluate(field, scene, experiment.query, text, experiment.protocol)
 
 
 def measure_quality(trained: Trained | None, raster: RasterConfig, exact: RasterConfig) -> Quality:

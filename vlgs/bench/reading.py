@@ -88,7 +88,7 @@ def stages(root: Path, started: float, heads: Path) -> list[tuple[str, float, fl
         Stage, and from its wall seconds on the columns of `Reached`.
     """
     from vlgs.bench.presets import build, composed
-    from vlgs.config import instantiate
+    from vlgs.experiment import construct
 
     rows: list[tuple[str, float, float, float]] = []
 
@@ -96,11 +96,11 @@ def stages(root: Path, started: float, heads: Path) -> list[tuple[str, float, fl
         rows.append((stage, time.time() - started, time.process_time(), peak_mib()))
 
     options = ["data=colmap", f"data.root={root}", "trainer=photos", f"head.cache_dir={heads}"]
-    config = composed(options)
+    experiment = construct(composed(options))
     reach("imports")
-    scene = instantiate(config.data)
+    scene = experiment.read_scene()
     reach("scene read")
-    module = build(config, scene)
+    module = build(experiment, scene)
     reach("Gaussians and head")
     for stage, work in _training(module):
         work()

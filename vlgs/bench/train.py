@@ -22,8 +22,7 @@ from vlgs.bench.sheet import (
     write_figure,
     write_sheet,
 )
-from vlgs.config import instantiate
-from vlgs.identity import run_id
+from vlgs.experiment import construct
 from vlgs.module.fit import FitOptions, fit
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS, turn
@@ -150,17 +149,19 @@ def run_train(
 def _curve(
     label: str, overrides: Sequence[str], out: Path, points: int, threads: int, seed: int
 ) -> pd.DataFrame:
-    config = composed([*BASE, *overrides, f"seed={seed}", f"threads={threads}", "progress=false"])
+    given = [*BASE, *overrides, f"seed={seed}", f"threads={threads}", "progress=false"]
+    experiment = construct(composed(given))
+    iterations = experiment.parts.trainer.iterations
     torch.set_num_threads(threads)
-    scene = instantiate(config.data)
-    path = curve_path(out / "train", scene.name, run_id(config, scene.fingerprint))
+    scene = experiment.read_scene()
+    path = curve_path(out / "train", scene.name, experiment.run_id(scene.fingerprint))
     if path.is_file():
         say(f"{scene.name}, {label}: {path} is there")
         return read_sheet(path).assign(label=label)
-    say(f"{scene.name}, {label}: {config.trainer.iterations} iterations ...")
+    say(f"{scene.name}, {label}: {iterations} iterations ...")
     header = provenance(seed, overrides=" ".join(overrides), training_threads=threads)
-    trained = Trained(config, scene, build(config, scene))
-    curve = Curve(trained, label, evaluated_at(config.trainer.iterations, points))
+    trained = Trained(experiment, scene, build(experiment, scene))
+    curve = Curve(trained, label, evaluated_at(iterations, points))
     with tempfile.TemporaryDirectory() as folder:
         options = FitOptions(meta={}, progress=False, callbacks=[curve])
         if fit(trained.module, RunFolder(Path(folder)), options) is not None:

@@ -15,8 +15,8 @@ from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.quality import score
 from vlgs.bench.sheet import provenance, read_sheet, say, show, write_sheet
 from vlgs.bench.unseen_draw import draw_unseen
-from vlgs.config import instantiate
-from vlgs.identity import RESULTS_VERSION, run_id
+from vlgs.experiment import construct
+from vlgs.identity import RESULTS_VERSION
 from vlgs.module.fit import FitOptions, fit
 from vlgs.report.provenance import commit
 from vlgs.runs import RunFolder
@@ -142,13 +142,14 @@ def _row(
 ) -> UnseenRow | None:
     """Train and score, unless a row of this run is known."""
     given = ["head.cache_dir=null", *task.overrides, *overrides]
-    config = composed([*given, f"seed={seed}", f"threads={threads}", "progress=false"])
-    scene = instantiate(config.data)
-    run = run_id(config, scene.fingerprint)
+    given += [f"seed={seed}", f"threads={threads}", "progress=false"]
+    experiment = construct(composed(given))
+    scene = experiment.read_scene()
+    run = experiment.run_id(scene.fingerprint)
     if run in known:
         return None
     started = time.process_time()
-    trained = Trained(config, scene, build(config, scene))
+    trained = Trained(experiment, scene, build(experiment, scene))
     with tempfile.TemporaryDirectory() as folder:
         if fit(trained.module, RunFolder(Path(folder)), FitOptions({}, progress=False)) is not None:
             raise KeyboardInterrupt
@@ -170,7 +171,7 @@ def _row(
 
 
 def _middle_tenth(overrides: Sequence[str]) -> list[str]:
-    names = sorted(view.name for view in instantiate(composed(overrides).data).train)
+    names = sorted(view.name for view in construct(composed(overrides)).read_scene().train)
     count = max(1, len(names) // 10)
     first = (len(names) - count) // 2
     return names[first : first + count]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra.utils import get_object
 from jaxtyping import UInt8
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
@@ -21,14 +22,12 @@ from rich.progress import (
 )
 
 from vlgs.config import instantiate
-from vlgs.data.colmap import open_training_views
+from vlgs.data.colmap import load_scene, open_training_views
 from vlgs.data.images import read_photograph
 from vlgs.data.source import ColmapSource
 from vlgs.data.views import ViewSource
 from vlgs.features.extractor import Extractor
 from vlgs.features.folder import FeatureFolder, pair_bytes
-
-_COLMAP = "vlgs.data.colmap.load_scene"
 
 _NO_NUMBER_MOVES = frozenset({"weights", "device", "batch"})
 """Keys of an extractor that are not part of the settings of a folder."""
@@ -82,7 +81,7 @@ def plan(config: DictConfig) -> Job:
         SceneError: If its photographs or cameras are at fault.
         ValueError: If an option cannot be right.
     """
-    if config.data._target_ != _COLMAP:
+    if get_object(config.data._target_) is not load_scene:
         raise ValueError(
             f"features: data must be photographs with cameras (data=colmap or a data set of it), got {config.data._target_}"
         )

@@ -12,7 +12,7 @@ class Head(Protocol):
 
     A head is either fitted to the embeddings of a scene before training, and stays as it is, or it is trained along with the
     Gaussians. What the language loss compares is `predict` of rendered codes with `targets` of masks: codes with codes, or
-    embeddings with embeddings.
+    embeddings with embeddings. A head that is fitted before says so: ``untrained: ClassVar[bool] = True`` (`vlgs.demands`).
     """
 
     dim: int
@@ -40,16 +40,3 @@ class Head(Protocol):
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """Unit embeddings of codes, which may be blends of several."""
         ...
-
-
-def require_codes(who: str, head: Head) -> None:
-    """Refuse a head that has no codes of embeddings before Gaussians are trained.
-
-    Raises:
-        ValueError: If it is trained along.
-    """
-    if head.learning_rate is not None:
-        raise ValueError(
-            f"{who}: head must be fitted before training, as codes of masks are lifted onto Gaussians "
-            f"(head=autoencoder or identity), got {type(head).__name__}, which is trained along"
-        )

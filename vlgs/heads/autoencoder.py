@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -93,6 +94,8 @@ class Autoencoder(nn.Module):
         ValueError: If a width is not positive or there is no hidden layer.
     """
 
+    untrained: ClassVar[bool] = True
+    """It is fitted before the Gaussians are trained."""
     learning_rate: float | None = None
     mean: Tensor
     fitted_reconstruction: Tensor

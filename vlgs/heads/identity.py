@@ -1,5 +1,7 @@
 """The head that changes nothing: Gaussians carry the embeddings themselves."""
 
+from typing import ClassVar
+
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
@@ -17,6 +19,8 @@ class Identity(nn.Module):
         ValueError: If `dim` is not positive.
     """
 
+    untrained: ClassVar[bool] = True
+    """It is fitted before the Gaussians are trained."""
     learning_rate: float | None = None
 
     def __init__(self, dim: int = 512) -> None:

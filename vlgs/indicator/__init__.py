@@ -1,12 +1,14 @@
 """Which weight per Gaussian blends language: l in Eq. 6, or what an ablation puts in its place (conf/README.md, D.10 and D.15)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.demands import Demand
 from vlgs.types import Gaussians
 
 
@@ -23,6 +25,9 @@ class Indicator(Protocol):
 class Learned:
     """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. 6)."""
 
+    without_color: ClassVar[bool] = True
+    """It blends Gaussians that have no colour."""
+
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
         """Return `gaussians.indicators` itself."""
         return gaussians.indicators
@@ -31,6 +36,10 @@ class Learned:
 @dataclass(frozen=True)
 class PerLevel:
     """A learned indicator of its own for every mask level (``levels=joint``)."""
+
+    demands: ClassVar[Sequence[Demand]] = (Demand("indicator=per_level", "levels", "joint"),)
+    without_color: ClassVar[bool] = True
+    """It blends Gaussians that have no colour."""
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
         """Return `gaussians.indicators` itself: [n] where a model has no levels (the colour of ``sharing=none``)."""
@@ -41,6 +50,8 @@ class PerLevel:
 class ColourOpacity:
     """Language blended with the colour opacity, as earlier systems do (Eq. 2)."""
 
+    untrained: ClassVar[bool] = True
+    """It learns nothing beside colour."""
     detach: bool = False
     """Whether the language loss is kept from moving the opacity; the paper lets it (conf/README.md, D.15)."""
 
@@ -57,6 +68,10 @@ class Fixed:
         ValueError: If the value is outside [0, 1].
     """
 
+    untrained: ClassVar[bool] = True
+    """There is nothing to learn."""
+    without_color: ClassVar[bool] = True
+    """It blends Gaussians that have no colour."""
     value: float
     """Above `RasterConfig.alpha_max` the rasteriser caps it."""
 

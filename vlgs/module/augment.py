@@ -4,7 +4,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,10 +16,14 @@ from vlgs.data.sampler import nearest_views
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.fields.splat import SplatModel
 from vlgs.files import write_atomically
+from vlgs.module.stages import Progress, Stage, Stages, TrainColor
+from vlgs.module.workshop import Workshop
 from vlgs.types import Camera, Scene, View
 from vlgs.values import require_range
 
 _CAMERAS = 7  # purpose of draws
+_FIRST = "augment"
+"""Name of the stage that renders."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +35,33 @@ class Shot:
     image: UInt8[Tensor, "h w 3"]
 
 
+@runtime_checkable
+class Augment(Stages, Protocol):
+    """The interface of an option of conf/augment."""
+
+    def identity(self) -> str:
+        """What moves the added views besides the configuration; counts for the id of a run."""
+        ...
+
+    def require(self, scenes: Mapping[int | None, Scene]) -> None:
+        """Refuse scenes that no views can be added to, before anything is trained."""
+        ...
+
+
 @dataclass(frozen=True)
 class NoAugment:
     """The training views alone."""
 
     def identity(self) -> str:
-        """See `Offline`."""
+        """See `Augment`."""
         return ""
 
     def require(self, scenes: Mapping[int | None, Scene]) -> None:
-        """See `Offline`."""
+        """See `Augment`."""
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """None."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -89,6 +110,10 @@ class Offline:
                 )
             if self.extractor is not None and level is None:
                 raise ValueError("augment: data must have a mask level for the extractor, got none")
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """A first model of colour alone, and the views that it renders; see `vlgs.module.stages.Stages`."""
+        return [TrainColor(_FIRST, kept=False), RenderViews(self)]
 
     def extend(
         self, scenes: Mapping[int | None, Scene], model: SplatModel, seed: int, folder: Path
@@ -147,6 +172,22 @@ class Offline:
         rows, compact = index.unique(return_inverse=True)
         first = int(rows[0] < 0)
         return (compact - first).int(), every[rows[rows >= 0].long()]
+
+
+@dataclass(frozen=True)
+class RenderViews:
+    """Adds views that an earlier stage renders to the training views of every mask level."""
+
+    augment: Offline
+    start: str = _FIRST
+    """The earlier stage."""
+
+    def run(self, progress: Progress, workshop: Workshop) -> Progress:
+        """See `vlgs.module.stages.Stage`."""
+        model = progress.gaussians(self.start, None)
+        maps = workshop.folder.part(self.start).path / "language"
+        scenes = self.augment.extend(progress.scenes, model, workshop.seed, maps)
+        return replace(progress, scenes=scenes)
 
 
 def _with_views(

@@ -14,7 +14,7 @@ from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
 from vlgs.gaussians.background import with_background
-from vlgs.heads import Head, require_codes
+from vlgs.heads import Head
 from vlgs.heads.autoencoder import Autoencoder
 from vlgs.indicator import Indicator, PerLevel
 from vlgs.interchange import load_weights, start_from
@@ -77,11 +77,9 @@ def build_module(
         # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
-    if config.init_features == "lifted":
-        require_codes("gaussians: init_features=lifted", head)
     width = head.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
-    own = language and parts.sharing.means and not parts.sharing.covariances
+    own = language and parts.sharing.own_shape
     several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
     levels = scene.mask_levels if several else None
     attributes = attributes_of(config, width, levels, own, asdict(parts.trainer.learning_rates))

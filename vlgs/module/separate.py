@@ -5,9 +5,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from vlgs.demands import has
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.none import NoFusion
-from vlgs.indicator import Fixed, Learned, PerLevel
+from vlgs.indicator import Learned
 from vlgs.module.build import Parts
 from vlgs.types import Scene
 
@@ -40,8 +41,7 @@ def for_language(parts: Parts) -> Parts:
         densify_on="total",
         densify=replace(config.densify, reset_indicator=True),
     )
-    own = isinstance(parts.indicator, (Fixed, PerLevel))
-    indicator = parts.indicator if own else Learned()
+    indicator = parts.indicator if has(parts.indicator, "without_color") else Learned()
     return replace(parts, gaussians=config, indicator=indicator)
 
 
@@ -60,12 +60,13 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
     levels = theirs["indicator_logits"].shape[1:]
     ours["indicator_logits"] = torch.full((n, *levels), NOWHERE)
     ours["features"] = torch.zeros(n, theirs["features"].shape[1])
-    if isinstance(language.indicator, Fixed):
+    indicator = language.indicator
+    if has(indicator, "untrained"):
         # A weight of exactly 1 has an infinite logit, which no file may hold.
-        value = torch.full((m,), language.indicator.value)
-        theirs["indicator_logits"] = value.logit().clamp(NOWHERE, -NOWHERE)
+        weight = indicator(language.gaussians())
+        theirs["indicator_logits"] = weight.logit().clamp(NOWHERE, -NOWHERE)
+        indicator = Learned()
     both: dict[str, Tensor] = {name: torch.cat([ours[name], theirs[name]]) for name in ours}
-    indicator = language.indicator if isinstance(language.indicator, PerLevel) else Learned()
     model = SplatModel(
         both,
         NoFusion(),

@@ -1,200 +1,242 @@
-"""The stages of a run: the models that it trains, one after the other.
+"""A method is an ordered list of stages. Each goes from a scene, and from what the stages before it made, to a trained model.
 
-Most runs train one model, in the folder of the run. Others train several, each in a sub-folder with its own checkpoint and
-log.csv. A finished stage is loaded from its checkpoint, so that the same command continues where it was stopped.
+The options of a run contribute their parts of the list: `vlgs.module.augment` further training views, `vlgs.module.levels` what
+happens to the mask levels, `vlgs.module.sharing` the models themselves.
+
+A stage makes each of its models in a sub-folder of the run, named after the mask level and the stage. A model that is finished there is
+read back, one that is not goes on from its checkpoint: the same command continues where it was stopped, with the same bits.
 """
 
-import logging
-import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Protocol, runtime_checkable
 
-import torch
-
+from vlgs.demands import Demand
 from vlgs.fields import Field
 from vlgs.fields.several import SeveralFields
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
-from vlgs.gaussians import Sharing
-from vlgs.module.augment import NoAugment, Offline
-from vlgs.module.build import Parts, build_module
-from vlgs.module.checkpoint import checkpoint_bytes, save_checkpoint
-from vlgs.module.fit import FitOptions, fit
-from vlgs.module.joint import join_levels
-from vlgs.module.lift import lift_features
-from vlgs.module.lightning import VLGSModule
-from vlgs.module.separate import for_language, unite, without_language
-from vlgs.module.state import capture
-from vlgs.runs import RunFolder
-from vlgs.skip_count import SkipCount
+from vlgs.module.build import Parts
+from vlgs.module.separate import without_language
+from vlgs.module.workshop import Workshop, unchanged
 from vlgs.types import Scene
 
-log = logging.getLogger(__name__)
+_TAKEN = ("augment", "checkpoint", "renders")
+"""Folders of a run that are no stage's of a method."""
 
-AUGMENT = "augment"
-"""Name of the model that renders further training views."""
-GEOMETRY = "geometry"
-"""Name of the model of colour that language is lifted onto."""
-
-
-class StoppedError(Exception):
-    """Training was asked to stop; what was reached is saved."""
-
-    def __init__(self, signal: str, where: str) -> None:
-        super().__init__(f"{signal}: stopped and saved at {where}")
+Level = int | None
+"""A mask level; None where a scene has no levels, or where something is of all levels."""
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One trained model."""
+class Progress:
+    """How far a run is: the scenes that are learned, and the models that are there."""
 
-    folder: RunFolder
-    model: SplatModel
-    seconds: float
-    """Of training."""
-    skips: SkipCount
-    checkpoint_bytes: int
-    color: bool = True
-    """Off: trained for language alone."""
+    scenes: Mapping[Level, Scene]
+    """Mask level -> the scene with the supervision of that level."""
+    models: Mapping[str, Mapping[Level, Field]] = field(default_factory=dict)
+    """Name of a stage -> mask level -> its model; a model of all levels stands under None. The last stage is last."""
 
-    @property
+    def folder(self, level: Level, name: str) -> str:
+        """Sub-folder of a stage's model: ``level_2/language``; the level is left out where there is one."""
+        prefix = f"level_{level}" if len(self.scenes) > 1 else ""
+        return "/".join(filter(None, [prefix, name]))
+
+    def model(self, name: str, level: Level) -> Field:
+        """What an earlier stage made for a mask level.
+
+        Raises:
+            ValueError: If no stage of that name came before.
+        """
+        _require_earlier(name, self.models)
+        models = self.models[name]
+        return models[level] if level in models else models[None]
+
+    def gaussians(self, name: str, level: Level) -> SplatModel:
+        """The same where Gaussians are needed.
+
+        Raises:
+            ValueError: If no stage of that name came before, or it made something else.
+        """
+        model = self.model(name, level)
+        if not isinstance(model, SplatField):
+            raise ValueError(f"stages: {name!r} must make Gaussians to start from, got none")
+        return model.model
+
+    def having(self, name: str, models: Mapping[Level, Field]) -> "Progress":
+        """One stage further."""
+        before = {own: made for own, made in self.models.items() if own != name}
+        return replace(self, models={**before, name: models})
+
     def field(self) -> Field:
-        """What was trained."""
-        return SplatField(self.model, self.color)
+        """The trained scene, of all mask levels in their order: what the last stage made."""
+        *_, last = self.models
+        models = [self.model(last, level) for level in self.scenes]
+        return models[0] if len(models) == 1 else SeveralFields(models)
 
 
-@dataclass
-class Stages:
-    """Trains models in sub-folders of a run.
+@runtime_checkable
+class Stage(Protocol):
+    """One stage of a method; a frozen dataclass of its settings."""
 
-    Args:
-        folder: Of the run.
-        make_parts: Fresh parts, which hold weights; called once per model, with the same random numbers each time.
-        make_options: Likewise, as loggers belong to one training.
-        seed: Of the run.
-    """
-
-    folder: RunFolder
-    make_parts: Callable[[], Parts]
-    make_options: Callable[[], FitOptions]
-    seed: int
-    done: dict[str, Stage] = field(default_factory=dict)
-    """Name -> stage, in the order of training."""
-
-    @property
-    def kept(self) -> list[Stage]:
-        """The stages that the result consists of, without those that only prepared others."""
-        return [stage for name, stage in self.done.items() if name not in (AUGMENT, GEOMETRY)]
-
-    def train(self, name: str, scene: Scene, color: bool = True) -> SplatModel:
-        """Train a model, or read it back.
-
-        Args:
-            name: Sub-folder; empty for the folder of the run itself.
-            scene: What it learns.
-            color: Off: language alone.
+    def run(self, progress: Progress, workshop: Workshop) -> Progress:
+        """Make what is missing, and return what is there then.
 
         Raises:
             StoppedError: If it was asked to stop.
         """
-        folder = self.folder.part(name)
-        if name:
-            log.info("model %s of this run, in %s", name, folder.path)
-        parts = self.make_parts()
-        module = build_module(scene, parts if color else for_language(parts), self.seed, color)
-        stopped_by = fit(module, folder, self.make_options())
-        if stopped_by is not None:
-            stage = f" of {name}" if name else ""
-            where = f"step {module.next_step} of {module.settings.iterations}{stage}"
-            raise StoppedError(stopped_by, where)
-        return self._finish(name, folder, module, color)
-
-    def lift(self, name: str, geometry: SplatModel, scene: Scene) -> SplatModel:
-        """Lift the language of a scene onto finished Gaussians (`lift_features`); the folder is as that of a trained model.
-
-        Args:
-            name: Sub-folder; empty for the folder of the run itself.
-            geometry: Trained on colour.
-            scene: Whose masks count.
-        """
-        folder, started = self.folder.part(name), time.perf_counter()
-        parts = self.make_parts()
-        start = {key: value.detach() for key, value in geometry.splats.items()}
-        start["features"] = torch.zeros(geometry.count, parts.head.dim * scene.mask_levels)
-        module = build_module(scene, parts, self.seed, start=start)
-        module.model.sh_degree = geometry.sh_degree
-        lift_features(module)
-        module.next_step = module.settings.iterations
-        module.train_seconds = time.perf_counter() - started
-        folder.require_own()
-        save_checkpoint(folder.checkpoint, capture(module, self.make_options().meta))
-        return self._finish(name, folder, module)
-
-    def _finish(
-        self, name: str, folder: RunFolder, module: VLGSModule, color: bool = True
-    ) -> SplatModel:
-        size, seconds = checkpoint_bytes(folder.checkpoint), module.train_seconds
-        self.done[name] = Stage(folder, module.model, seconds, module.skips, size, color)
-        return module.model
+        ...
 
 
-def train_all(
-    stages: Stages,
-    scenes: Mapping[int | None, Scene],
-    sharing: Sharing,
-    augment: Offline | NoAugment,
-    joint: bool = False,
-) -> Field:
-    """Train everything that a run is made of.
+@runtime_checkable
+class Stages(Protocol):
+    """An option that contributes to the list of stages."""
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """The option's part of the list; `language` is off where a scene has nothing to learn it from."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """The stages that a configuration lists, in place of those of ``sharing``.
+
+    Raises:
+        ValueError: If a stage starts from one that does not come before it, two have one name, or there is none.
+    """
+
+    listed: Sequence[Stage]
+
+    def __post_init__(self) -> None:
+        names: list[str] = []
+        for stage in self.listed:
+            name, start = getattr(stage, "name", None), getattr(stage, "start", None)
+            if start is not None:
+                _require_earlier(start, names)
+            if name in names:
+                raise ValueError(f"stages: name must differ from those before it, got {name!r}")
+            if name in _TAKEN or not re.fullmatch(r"[a-z0-9_]*", name or ""):
+                raise ValueError(
+                    f"stages: name must be of small letters, digits and _, and none of {', '.join(_TAKEN)}, got {name!r}"
+                )
+            names += [] if name is None else [name]
+        if not self.listed:
+            raise ValueError("stages: there must be at least one, got none")
+
+    @property
+    def demands(self) -> Sequence[Demand]:
+        """Those of its stages, and that nothing else says how models are made."""
+        asked = [demand for stage in self.listed for demand in getattr(stage, "demands", ())]
+        why = "as the stages say how models are made"
+        return [Demand("stages of a method", "sharing", "replaceable", why), *asked]
+
+    def stages(self, language: bool) -> Sequence[Stage]:
+        """See `Stages`."""
+        return self.listed
+
+
+def run_stages(
+    options: Iterable[Stages], scenes: Mapping[Level, Scene], workshop: Workshop
+) -> Progress:
+    """Make everything that a run is made of.
 
     Args:
-        stages: Where and with what.
-        scenes: Mask level -> the scene with the supervision of that level; one, or several for ``levels=separate`` and ``joint``.
-        sharing: Whether colour and language are one model, and whether language is trained at all.
-        augment: Further training views, rendered from a first model of colour alone (conf/README.md, D.17); what `Offline.require`
-            asks for is there.
-        joint: Whether one model learns all levels.
-
-    Returns:
-        The trained scene, of all mask levels in their order.
+        options: In the order of their stages.
+        scenes: Mask level -> the scene with the supervision of that level. Where none has language the last one stands for all.
+        workshop: Where and with what.
 
     Raises:
         StoppedError: If training was asked to stop.
     """
-    if not any(len(scene.mask_vectors) for scene in scenes.values()):
-        scenes = dict(list(scenes.items())[-1:])
-    if isinstance(augment, Offline):
-        first = stages.train(AUGMENT, without_language(next(iter(scenes.values()))))
-        maps = stages.folder.path / AUGMENT / "language"
-        scenes = augment.extend(scenes, first, stages.seed, maps)
-    if joint:
-        scenes = {None: join_levels(list(scenes.values()))}
-    models, color = [], None
-    for level, scene in scenes.items():
-        name = f"level_{level}" if len(scenes) > 1 else ""
-        if sharing.lifted and len(scene.mask_vectors):
-            color = color or stages.train(GEOMETRY, without_language(scene))
-            models.append(stages.lift(name, color, scene))
-            continue
-        if sharing.means:
-            models.append(stages.train(name, scene))
-            continue
-        color = color or stages.train("color", without_language(scene))
-        if len(scene.mask_vectors) == 0:
-            models.append(color)
-        else:
-            language = stages.train("/".join(filter(None, [name, "language"])), scene, color=False)
-            models.append(unite(color, language))
-    fields = [SplatField(model) for model in models]
-    return fields[0] if len(fields) == 1 else SeveralFields(fields)
+    language = any(len(scene.mask_vectors) for scene in scenes.values())
+    progress = Progress(scenes if language else dict(list(scenes.items())[-1:]))
+    for stage in list_stages(options, language):
+        progress = stage.run(progress, workshop)
+    return progress
 
 
-def all_skips(stages: Iterable[Stage]) -> SkipCount:
-    """The skips of all stages together."""
-    total = SkipCount()
-    for stage in stages:
-        for name, work in stage.skips.work.items():
-            total.add(name, work.done, work.seconds)
-        for name, count in stage.skips.skipped.items():
-            total.skip(name, count)
-    return total
+def list_stages(options: Iterable[Stages], language: bool = True) -> Iterator[Stage]:
+    """The stages of a run, in their order."""
+    for option in options:
+        yield from option.stages(language)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Trains Gaussians on the colour and the language of a scene, a model for each mask level."""
+
+    name: str = ""
+    """Of the sub-folder; empty for the folder of the run, or of the mask level."""
+    start: str | None = None
+    """The earlier stage whose Gaussians it starts from; None: those of ``gaussians``."""
+    freeze: Sequence[str] = ()
+    """Parameters that keep their values beside those of ``trainer.freeze``; with any of them nothing is densified."""
+
+    def run(self, progress: Progress, workshop: Workshop) -> Progress:
+        """See `Stage`."""
+        models = {}
+        for level, scene in progress.scenes.items():
+            start = None if self.start is None else progress.gaussians(self.start, level)
+            folder = progress.folder(level, self.name)
+            models[level] = workshop.train(folder, scene, self._change, start)
+        return progress.having(self.name, models)
+
+    def _change(self, parts: Parts) -> Parts:
+        if self.start is None and not self.freeze:
+            return unchanged(parts)
+        trainer, gaussians = parts.trainer, parts.gaussians
+        frozen = dict.fromkeys([*trainer.freeze, *self.freeze])
+        # Harmonics that come trained are not taken away again: every degree is there after three iterations.
+        every = trainer.sh_every if self.start is None else 1
+        trainer = replace(trainer, freeze=list(frozen), sh_every=every)
+        stop = 0 if frozen else gaussians.densify.stop
+        gaussians = replace(gaussians, densify=replace(gaussians.densify, stop=stop))
+        return replace(parts, trainer=trainer, gaussians=gaussians)
+
+
+@dataclass(frozen=True)
+class TrainColor:
+    """Trains Gaussians on colour alone: one model, whatever the mask levels."""
+
+    name: str
+    """Of the sub-folder."""
+    kept: bool = True
+    """Off: it only prepares others, and is no part of the result."""
+
+    def run(self, progress: Progress, workshop: Workshop) -> Progress:
+        """See `Stage`."""
+        scene = without_language(next(iter(progress.scenes.values())))
+        model = workshop.train(self.name, scene, kept=self.kept)
+        return progress.having(self.name, {None: model})
+
+
+@dataclass(frozen=True)
+class Lift:
+    """Gives every Gaussian of an earlier stage the mean code of the masked pixels that it is blended into; nothing is trained."""
+
+    demands: ClassVar[Sequence[Demand]] = tuple(
+        Demand("language that is lifted", group, "untrained", "as nothing trains it")
+        for group in ("fusion", "indicator", "head")
+    )
+    start: str
+    """The earlier stage."""
+    name: str = ""
+    """Of the sub-folder; empty for the folder of the run, or of the mask level."""
+
+    def run(self, progress: Progress, workshop: Workshop) -> Progress:
+        """See `Stage`. A mask level without a single mask has nothing to be lifted, and is trained on colour."""
+        models = {}
+        for level, scene in progress.scenes.items():
+            folder = progress.folder(level, self.name)
+            if len(scene.mask_vectors):
+                models[level] = workshop.lift(folder, scene, progress.gaussians(self.start, level))
+            else:
+                models[level] = workshop.train(folder, scene)
+        return progress.having(self.name, models)
+
+
+def _require_earlier(name: str, known: Collection[str]) -> None:
+    if name not in known:
+        listed = ", ".join(map(repr, known)) or "none"
+        raise ValueError(f"stages: start must be an earlier stage ({listed}), got {name!r}")

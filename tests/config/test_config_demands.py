@@ -1,0 +1,68 @@
+"""What options ask of each other is said by the options, and checked in one place for all commands."""
+
+from pathlib import Path
+
+import pytest
+from tiny_runs import composed
+
+from vlgs.check import Report, start
+from vlgs.demands import Demand, unmet
+from vlgs.experiment import construct
+from vlgs.indicator import PerLevel
+from vlgs.known import options
+from vlgs.module.levels import LEVEL_OPTIONS
+from vlgs.module.sharing import Lifted, TwoModels
+
+DEMANDS = [demand for option in (PerLevel, TwoModels, Lifted) for demand in option.demands]
+
+GATED = """
+class Gated:
+    def __call__(self, color, feature):
+        return color, feature
+
+class Apart(Gated):
+    separable = True
+"""
+
+
+@pytest.mark.parametrize("demand", DEMANDS, ids=str)
+def test_a_demand_names_options_that_exist_and_one_that_meets_it(demand: Demand):
+    group, _, name = demand.asker.partition("=")
+    assert name in options(group)
+    known = list(LEVEL_OPTIONS) if demand.group == "levels" else options(demand.group)
+    met = {"fusion": "none", "indicator": "opacity", "levels": "joint"}
+    fitting = {other: f"{other}={option}" for other, option in met.items() if other != group}
+    construct(composed(demand.asker, *fitting.values()))
+    wrong = next(name for name in reversed(known) if name not in (met[demand.group], "fixed"))
+    fitting[demand.group] = f"{demand.group}={wrong}"
+    said = (
+        f"config: {demand.group} must be .*{met[demand.group]} with {demand.asker}.*, got {wrong}$"
+    )
+    with pytest.raises(ValueError, match=said):
+        construct(composed(demand.asker, *fitting.values()))
+
+
+def test_check_says_what_run_says_beside_the_faults_of_the_scene():
+    config, fault = composed("sharing=none"), Report((), ("scene",))
+    with pytest.raises(ValueError, match="fusion must be none with sharing=none") as raised:
+        construct(config)
+    report = start(config, fault)
+    assert [str(fault) for fault in report.faults] == [str(raised.value)]
+    assert report.summary == ("scene",)
+
+
+def test_a_part_of_a_plugin_is_refused_until_it_says_that_it_fits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "my_lab.py").write_text(GATED)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    apart = ("sharing=none", "fusion=none")
+    with pytest.raises(ValueError, match=r"fusion must be none with .*, got my_lab\.Gated"):
+        construct(composed(*apart, "fusion._target_=my_lab.Gated"))
+    construct(composed(*apart, "fusion._target_=my_lab.Apart"))
+
+
+def test_what_says_nothing_has_no_property():
+    asking = TwoModels()
+    assert list(unmet({"sharing": asking, "fusion": object()})) == list(TwoModels.demands)
+    assert not list(unmet({"fusion": object()}))

@@ -1,0 +1,119 @@
+"""A method is a YAML file: an overlay of the axes, and a list of stages."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import DictConfig
+from tiny_runs import TINY, composed
+
+from vlgs.config import check_config
+from vlgs.experiment import construct
+from vlgs.identity import identity
+from vlgs.known import option
+from vlgs.module.checkpoint import load_checkpoint
+from vlgs.module.stages import Lift, Train, TrainColor
+from vlgs.run import run
+from vlgs.runs import RunFolder
+
+FEATURES = """# @package _global_
+defaults:
+  - override /fusion: none
+  - override /indicator: opacity
+  - override /blend: none
+levels: joint
+stages:
+  - {_target_: vlgs.module.stages.TrainColor, name: geometry, kept: false}
+  - _target_: vlgs.module.stages.Train
+    start: geometry
+    freeze: [means, quats, log_scales, sh0, shN, opacity_logits]
+"""
+LIFT = (
+    FEATURES.partition("  - _target_")[0]
+    + "  - {_target_: vlgs.module.stages.Lift, start: geometry}\n"
+)
+
+
+@pytest.fixture
+def chosen(tmp_path: Path):
+    """Composes a command line of somebody with two methods of their own."""
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "features.yaml").write_text(FEATURES)
+    (tmp_path / "method" / "lift.yaml").write_text(LIFT)
+    path = f"hydra.searchpath=[file://{tmp_path}]"
+    return lambda *overrides: composed(path, *TINY, *overrides)
+
+
+def test_a_method_is_an_overlay_that_the_command_line_overrides(chosen):
+    config: DictConfig = chosen("method=features")
+    check_config(config)
+    experiment = construct(config)
+    freeze = config.stages[1].freeze
+    stages = [TrainColor("geometry", kept=False), Train(start="geometry", freeze=freeze)]
+    assert experiment.method is not None
+    assert experiment.method.listed == stages
+    assert experiment.level_models == "joint"
+    assert config.fusion._target_.endswith("NoFusion")
+    given = chosen("method=features", "fusion=mlp", "levels=single")
+    assert given.fusion._target_.endswith("MLP")
+    assert given.levels == "single"
+    assert construct(chosen("method=vlgs")).method is None
+
+
+def test_what_a_method_trains_moves_the_id_and_the_name_of_a_class_does_not(chosen):
+    axes = ("fusion=none", "indicator=opacity", "blend=none", "levels=joint")
+    plain, features, lift = (
+        identity(chosen(*overrides)).recipe
+        for overrides in (axes, ("method=features",), ("method=lift",))
+    )
+    assert len({plain, features, lift}) == 3
+    kinds = [
+        f"stages=[{{_target_: vlgs.module.stages.{kind}, start: x}}]" for kind in ("Train", "Lift")
+    ]
+    assert len({identity(chosen(kind)).recipe for kind in kinds}) == 2
+    assert option("stages.0", "vlgs.module.stages.Train") == "train"
+
+
+def test_a_method_runs(chosen, tmp_path: Path):
+    config = chosen(
+        "method=features", "trainer=smoke", "trainer.iterations=12", f"results={tmp_path}"
+    )
+    config.pictures = False
+    assert run(config) == 0
+    (path,) = (tmp_path / "runs").iterdir()
+    for name in ("", "geometry"):
+        checkpoint = load_checkpoint(RunFolder(path / name).checkpoint)
+        assert checkpoint is not None
+        assert checkpoint.step == 12
+    assert (path / "point_cloud.ply").is_file()
+    assert not (path / "geometry" / "point_cloud.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["method=features", "sharing=none"], "sharing must be pos or pos_cov with stages of a method, as .*, got none"),
+        (["method=lift", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
+        (["stages=[3]"], "config: stages must be a list of stages, got"),
+        (["stages=[{_target_: vlgs.module.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
+        (["stages=[{_target_: vlgs.module.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),
+        (["stages=[{_target_: vlgs.module.stages.Train, name: renders}]"], r"none of augment, .*got 'renders'"),
+        (["stages=[]"], "stages: there must be at least one, got none"),
+        (["stages=[{_target_: vlgs.run.run}]"], "stages.0._target_ must be one of"),
+    ],
+)  # fmt: skip
+def test_what_no_method_can_be_is_refused(chosen, overrides: list[str], message: str):
+    config = chosen(*overrides)
+
+    def refuse() -> None:
+        check_config(config)
+        construct(config)
+
+    with pytest.raises(ValueError, match=message):
+        refuse()
+
+
+def test_two_stages_of_one_name_are_refused():
+    from vlgs.module.stages import Method
+
+    with pytest.raises(ValueError, match="name must differ from those before it, got ''"):
+        Method([TrainColor("geometry"), Train(), Lift("geometry")])

@@ -1,0 +1,82 @@
+"""Everything that a run does after its last step: scores, pictures, point clouds, and the metrics that mark it as finished."""
+
+import resource
+from dataclasses import asdict, replace
+from typing import Any
+
+from vlgs.fields.cloud import write_point_cloud
+from vlgs.identity import RESULTS_VERSION
+from vlgs.module.stages import Progress
+from vlgs.module.workshop import Workshop, all_skips
+from vlgs.prepare import Prepared
+from vlgs.query import TextEncoder
+from vlgs.report.evaluate import evaluate
+from vlgs.report.pictures import write_pictures
+from vlgs.report.provenance import commit, machine
+from vlgs.report.results import write_metrics, write_queries
+from vlgs.report.timing import measure_fps
+from vlgs.report.words import questions_of
+
+
+def report(
+    ready: Prepared, progress: Progress, workshop: Workshop, text: TextEncoder | None
+) -> dict[str, Any]:
+    """Evaluate the trained scene and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished.
+
+    Args:
+        ready: What the run was told.
+        progress: Whose result is evaluated.
+        workshop: That made it, in the folder of the run.
+        text: Encodes words; None if there is nothing to ask.
+
+    Returns:
+        The content of metrics.json.
+    """
+    experiment, scene, folder = ready.experiment, ready.scene, workshop.folder
+    field, query = progress.field(), experiment.query
+    language = len(scene.mask_vectors) > 0
+    folder.require_own()
+    cameras = [view.camera for view in scene.train]
+    clouds = [
+        made.folder.ply
+        for made in workshop.kept
+        if write_point_cloud(made.folder.ply, made.field, cameras)
+    ]
+    evaluation = evaluate(field, scene, query, text, experiment.protocol)
+    asked = questions_of(field, scene, query, text)
+    prompts = asked.prompts if asked else None
+    if asked and asked.note:
+        query = asked.query
+        evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
+    if len(progress.scenes) > 1:
+        first, *_, last = progress.scenes
+        whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
+        evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
+    cameras = [view.camera for view in scene.test or scene.train]
+    timing = measure_fps(field, cameras, query, prompts, language)
+    if experiment.pictures:
+        write_pictures(folder.renders, field, scene, query, prompts)
+    extra = {
+        "n_gaussians": sum(made.gaussians for made in workshop.kept),
+        "levels": [level for level in ready.scenes if level is not None] if language else [],
+        "level_models": experiment.level_models,
+        "train_seconds": sum(made.seconds for made in workshop.made.values()),
+        "skips": all_skips(workshop.made.values()).report(),
+        "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "ply_bytes": sum(path.stat().st_size for path in clouds) if clouds else None,
+        "checkpoint_bytes": sum(made.checkpoint_bytes for made in workshop.kept),
+        "seed": experiment.seed,
+        "config_hash": folder.path.name,
+        "recipe": experiment.identity.recipe,
+        "data_recipe": experiment.identity.data,
+        "dataset": experiment.dataset,
+        "scene": scene.name,
+        "fingerprint": scene.fingerprint,
+        "results_version": RESULTS_VERSION,
+        "commit": commit(),
+        "machine": machine(),
+        **asdict(timing),
+    }
+    folder.require_own()
+    write_queries(folder.queries, evaluation)
+    return write_metrics(folder.metrics, evaluation, extra)
