@@ -12,8 +12,8 @@ TINY = (
     "data.test_views=2",
     "data.points=400",
     "gaussians.background=0",
-    "codec.training.steps=30",
-    "codec.cache_dir=null",
+    "head.training.steps=30",
+    "head.cache_dir=null",
     "progress=false",
 )
 """Overrides under which a run takes a second or two."""

@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from vlgs.config import quote_override, split_override
 
 _PLACE = re.compile(
-    r"results|gaussians\.init|codec\.(weights|cache_dir)|text\.model|hydra\.(run|sweep)\.dir"
+    r"results|gaussians\.init|head\.(weights|cache_dir)|text\.model|hydra\.(run|sweep)\.dir"
     r"|data\.(root|scene|images|labels|features|vocabulary|cache|release\.labels)"
     r"|(features|augment)\.(.+\.)?(out|weights|folder)"
 )

@@ -164,10 +164,10 @@ def training_memory(experiment: Experiment) -> tuple[str, tuple[Fault, ...]]:
 
     Value, gradient and Adam's two moments of every parameter at `gaussians.max_count`; images and activations come on top.
     """
-    gaussians, codec = experiment.parts.gaussians, experiment.parts.codec
+    gaussians, head = experiment.parts.gaussians, experiment.parts.head
     geometry, weights = 3 + 4 + 3, 2  # means, quats, scales; opacity and indicator
     parameters = geometry + weights + 3 * (gaussians.sh_degree + 1) ** 2
-    parameters += experiment.levels.codes * codec.dim
+    parameters += experiment.levels.codes * head.dim
     needed = gaussians.max_count * parameters * 4 * 4
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     line = f"training    {needed / 2**20:.0f} MiB for {gaussians.max_count} Gaussians at most, with their optimiser"

@@ -117,6 +117,8 @@ def _check_overrides(overrides: Sequence[Override], extra: Path | None, name: st
     }
     for override in overrides:
         key, said = override.key_or_group, override.input_line
+        if (now := renamed(key)) is not None:
+            raise ValueError(f"command: {key} must be given as {now}, its new name, got {said}")
         if override.type == OverrideType.DEL:
             raise ValueError(
                 f"command: keys must be given or left alone, got {said}, which takes {key} away"
@@ -205,8 +207,7 @@ def _explain(overrides: Sequence[Override], name: str, extra: Path | None) -> No
         if override.type == OverrideType.ADD and key in known:
             raise ValueError(f"command: {key} must be given without +, got {override.input_line}")
         if override.type == OverrideType.CHANGE and key not in known:
-            now = renamed(key)
-            hint = f"; it is called {now} now" if now else _elsewhere(key) or _meant(key, known)
+            hint = _elsewhere(key) or _meant(key, known)
             raise ValueError(f"config: {key} must be a key, got one that is not there{hint}")
 
 

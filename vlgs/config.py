@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from vlgs import targets
 from vlgs.known import CONF as CONF
-from vlgs.known import is_ours, join, last, nodes, unread
+from vlgs.known import FORMER, is_ours, join, last, nodes, renamed, unread
 from vlgs.text import visible
 from vlgs.values import require_range, require_types
 
@@ -25,7 +25,7 @@ OmegaConf.register_new_resolver(
     lambda levels, width: width * (len(LEVELS) if levels == "joint" else 1),
     replace=True,
 )
-"""``${code_channels:${levels},${codec.dim}}``: language channels of a Gaussian, which is what a fusion is built for."""
+"""``${code_channels:${levels},${head.dim}}``: language channels of a Gaussian, which is what a fusion is built for."""
 
 MOST_THREADS = 256
 """Largest number of threads; no machine has more, and starting them would fail half-way."""
@@ -102,7 +102,9 @@ def _require_place(results: str) -> None:
 
 def _unresolved(error: OmegaConfBaseException) -> ValueError:
     reason = str(error).strip().partition("\n")[0]
-    return ValueError(f"config: {error.full_key} must have a value, got: {reason}")
+    former = next((old for old in FORMER.values() if f"'{old}" in reason), None)
+    hint = f"; {former} is called {renamed(former)} now" if former is not None else ""
+    return ValueError(f"config: {error.full_key} must have a value, got: {reason}{hint}")
 
 
 def _check_root(config: DictConfig) -> None:

@@ -20,7 +20,7 @@ _HELP = """Formats, by suffix; --as says which where a suffix has several:
 
   Gaussians     IN .ply .splat .pth, or the folder of a run -> OUT {gaussians}
   autoencoder   IN best_ckpt.pth -> OUT .safetensors (ours), or back
-  language      IN language_features/ --codec best_ckpt.pth -> OUT language_features_dim3/
+  language      IN language_features/ --head best_ckpt.pth -> OUT language_features_dim3/
   cameras       IN a scene's folder (COLMAP) or transforms.json -> OUT transforms.json, or a folder for COLMAP's files
 
 Rows that are not finite or have no rotation are counted, and refuse the file; --drop leaves them out."""
@@ -40,11 +40,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("target", type=Path, metavar="OUT")
     names = [*FORMATS, *_COLMAP]
     parser.add_argument("--as", dest="name", choices=names, help="format of OUT")
-    parser.add_argument("--codec", type=Path, help="autoencoder that makes codes of language maps")
+    parser.add_argument("--head", type=Path, help="autoencoder that makes codes of language maps")
+    parser.add_argument("--codec", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--drop", action="store_true", help="leave broken Gaussians out")
     given = parser.parse_args(arguments)
+    if given.codec is not None:
+        parser.error(f"--codec must be given as --head, its new name, got --codec {given.codec}")
     try:
-        for line in convert(given.source, given.target, given.name, given.codec, given.drop):
+        for line in convert(given.source, given.target, given.name, given.head, given.drop):
             sys.stdout.write(f"{line}\n")
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
@@ -54,7 +57,7 @@ def convert(
     source: Path,
     target: Path,
     name: str | None = None,
-    codec: Path | None = None,
+    head: Path | None = None,
     drop: bool = False,
 ) -> list[str]:
     """Read, write, and say in a few lines what was done and what was lost.
@@ -68,8 +71,8 @@ def convert(
         raise FileNotFoundError(f"convert: IN must exist, got {source}")
     if source.resolve() == target.resolve():
         raise ValueError(f"convert: OUT must be another path than IN, got {target}")
-    if codec is not None:
-        count = compress_language(source, target, read_autoencoder(codec))
+    if head is not None:
+        count = compress_language(source, target, read_autoencoder(head))
         return [f"{target}: language codes of {count} views"]
     if _is_run(source):
         source, lines = _point_cloud_of(source)
@@ -132,12 +135,12 @@ def _convert_autoencoder(source: Path, target: Path) -> list[str]:
 
     from vlgs.files import write_atomically
 
-    codec = read_autoencoder(source)
+    head = read_autoencoder(source)
     if target.suffix == ".safetensors":
-        write_atomically(target, save(codec.state_dict()))
+        write_atomically(target, save(head.state_dict()))
     else:
-        write_autoencoder(target, codec)
-    return [f"{target}: autoencoder {codec.mean.shape[0]} -> {codec.dim}"]
+        write_autoencoder(target, head)
+    return [f"{target}: autoencoder {head.mean.shape[0]} -> {head.dim}"]
 
 
 def _convert_cameras(source: Path, target: Path, name: str | None) -> list[str]:

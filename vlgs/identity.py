@@ -34,7 +34,7 @@ _MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
 
 MOVES_NOTHING = frozenset(
     {
-        "codec.cache_dir",
+        "head.cache_dir",
         "data.allow_missing_masks",  # refuses a scene, or does nothing
         "data.cache",
         "data.cache_bytes",
@@ -59,7 +59,7 @@ no bit: what they move is the time that table `skips` compares."""
 PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "scene"})
 """Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
 
-GIVEN_FILES = (("gaussians", "init"), ("codec", "weights"))
+GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
 AS_WITHOUT: Mapping[str, Any] = {
@@ -95,7 +95,7 @@ def identity(config: DictConfig) -> Identity:
     """What tells runs of a table apart; see `Identity`."""
     plain = _plain(config)
     data, seed = plain.pop("data"), plain.pop("seed")
-    given = {".".join(key): (plain.get(key[0]) or {}).get(key[1]) for key in GIVEN_FILES}
+    given = {former(".".join(key)): (plain.get(key[0]) or {}).get(key[1]) for key in GIVEN_FILES}
     names = {key: Path(str(path)).name for key, path in given.items() if path is not None}
     read = {key: value for key, value in data.items() if key not in PLACES}
     return Identity(_digest(_without_files(plain) | names), _digest(_counted(read, "data")), seed)
@@ -119,7 +119,7 @@ def _plain(config: DictConfig) -> dict[str, Any]:
 
 
 def _without_files(plain: Mapping[str, Any]) -> dict[str, Any]:
-    files = {".".join(key) for key in GIVEN_FILES}
+    files = {former(".".join(key)) for key in GIVEN_FILES}
     return {key: value for key, value in _counted(plain).items() if key not in files}
 
 

@@ -23,6 +23,7 @@ OPEN = frozenset({"gaussians.attributes", "loss"})
 """Keys whose children a user names: objectives, further attributes of a Gaussian."""
 
 FORMER: Mapping[str, str] = {
+    "head": "codec",
     "loss.photometric.error": "loss.rgb_loss",
     "loss.language.error": "loss.lang_loss",
     "loss.language.pixels": "loss.lang_pixels",
@@ -142,7 +143,9 @@ def unread(config: Mapping[str, Any], name: str = "config") -> Iterator[tuple[st
     """
     top = _top(name)
     for key, value in config.items():
-        if key not in top:
+        if (now := renamed(str(key))) is not None:
+            yield str(key), [now]
+        elif key not in top:
             yield str(key), near(str(key), top | {g for g in groups() if "/" not in g})
         elif isinstance(value, Mapping | list):
             yield from _unread_in(str(key), value)

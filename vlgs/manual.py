@@ -15,7 +15,7 @@ def describe(group: str, option: str) -> str:
         >>> print(describe("fusion", "mlp"))
         fusion=mlp
           fusion.color_dim=3
-          fusion.feature_dim=${code_channels:${levels},${codec.dim}}
+          fusion.feature_dim=${code_channels:${levels},${head.dim}}
           fusion.residual=true
     """
     path = CONF / group / f"{option}.yaml"

@@ -9,9 +9,9 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from vlgs.codec.autoencoder import Autoencoder
 from vlgs.data.faults import Fault, warning
 from vlgs.experiment import Experiment, Scenes
+from vlgs.heads.autoencoder import Autoencoder
 from vlgs.interchange import file_digest
 from vlgs.module.build import Parts
 from vlgs.module.fit import FitOptions
@@ -134,10 +134,10 @@ def rehearse(ready: Prepared) -> None:
 
     def make_parts() -> Parts:
         parts = experiment.make_parts()
-        codec, trainer = parts.codec, parts.trainer
-        if isinstance(codec, Autoencoder):
-            steps = min(_STEPS, codec.fit_settings.steps)
-            codec.fit_settings, codec.cache_dir = replace(codec.fit_settings, steps=steps), None
+        head, trainer = parts.head, parts.trainer
+        if isinstance(head, Autoencoder):
+            steps = min(_STEPS, head.fit_settings.steps)
+            head.fit_settings, head.cache_dir = replace(head.fit_settings, steps=steps), None
         return replace(parts, trainer=replace(trainer, iterations=min(_STEPS, trainer.iterations)))
 
     _, *further = experiment.stages()  # views are not added: that takes as long as the run

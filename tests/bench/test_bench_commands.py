@@ -83,11 +83,11 @@ def test_reading_and_protocols_leave_their_stages_and_costs(tmp_path: Path):
     reading, protocols = (read_sheet(tmp_path / f"{n}.csv") for n in ("reading", "protocols"))
     for _, stages in reading.groupby("language"):
         assert list(stages.stage)[:4] == [
-            *("imports", "scene read", "Gaussians and codec", "first step")
+            *("imports", "scene read", "Gaussians and head", "first step")
         ]
         for growing in ("wall_seconds", "cpu_seconds", "peak_mib"):
             assert stages[growing].is_monotonic_increasing
-    assert list(reading.language.unique()) == ["none", "codec fitted", "codec cached"]
+    assert list(reading.language.unique()) == ["none", "head fitted", "head cached"]
     assert set(protocols.protocol) >= {"dense", "lerf_ovs", "lerf_ovs (v2)", "select3d"}
 
 

@@ -25,7 +25,7 @@ from vlgs.types import Camera
 
 @pytest.fixture(scope="module")
 def trained() -> Trained:
-    return train_a_little([*QUICK, "codec.cache_dir=null", "progress=false"], steps=20)
+    return train_a_little([*QUICK, "head.cache_dir=null", "progress=false"], steps=20)
 
 
 def test_every_switch_of_training_has_a_row_and_keeps_its_promise(trained: Trained):

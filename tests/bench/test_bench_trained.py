@@ -12,7 +12,7 @@ from vlgs.bench.train import QUICK
 
 
 def test_a_trained_view_is_what_the_model_renders_and_its_run_loads(tmp_path: Path):
-    overrides = [*QUICK, "codec.cache_dir=null", "progress=false", "trainer.iterations=25"]
+    overrides = [*QUICK, "head.cache_dir=null", "progress=false", "trainer.iterations=25"]
     trained = train_or_load(overrides, tmp_path)
     module, camera = trained.module, trained.scene.test[0].camera
     assert module.model.sh_degree > 0

@@ -19,7 +19,7 @@ from vlgs.known import CONF, contents, groups, is_group, last, nodes, option, op
 
 MOVING_NOTHING = (
     *("results", "progress", "pictures", "on_existing", "threads", "plugins", "logger.loggers"),
-    *("codec.cache_dir", "data.cache", "data.cache_bytes", "data.allow_missing_masks"),
+    *("head.cache_dir", "data.cache", "data.cache_bytes", "data.allow_missing_masks"),
     *("raster.memory_budget", "trainer.checkpoint_every", "trainer.log_every"),
     *(f"augment.extractor.{part}.pretrained.{key}" for part in ("segmenter", "encoder") for key in ("device", "weights")),
 )  # fmt: skip
@@ -29,7 +29,7 @@ that it moves nothing."""
 NAMES = {
     "augment": "none offline",
     "blend": "beta fixed gaussian none uniform",
-    "codec": "autoencoder identity",
+    "head": "autoencoder identity linear",
     "data": "colmap synthetic",
     "encoder": "clip maps",
     "fusion": "cross mlp none self",
@@ -53,7 +53,7 @@ IDS = {
         "7c33df2765de0765",
         "bca9eee803a5ac58",
     ),
-    "data=colmap data.root=here codec=identity sharing=pos protocol=lerf_ovs_v2": (
+    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2": (
         "cbf2231b856ab97f",
         "11f318e48e5049a8",
         "7fa5eb265910cece",
@@ -181,7 +181,7 @@ def test_where_a_class_lies_and_what_it_is_called_change_no_id(tmp_path: Path):
     shutil.copytree(CONF, tmp_path / "conf")
     chosen = [
         "fusion=mlp",
-        "fusion=none codec=identity blend=none",
+        "fusion=none head=identity blend=none",
         "augment=offline_sam features/encoder=dinov2",
     ]
     # The finder of an editable install would lead to the package here instead of to the copy.

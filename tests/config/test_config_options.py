@@ -13,7 +13,7 @@ CONSTRUCTED = (
     "fusion",
     "indicator",
     "blend",
-    "codec",
+    "head",
     "loss",
     "raster",
     "trainer",

@@ -68,8 +68,8 @@ def test_runs_of_one_recipe_differ_in_seed_scene_and_place_only():
     ],
 )
 def test_foreign_targets_are_refused(target: str):
-    bad = config(codec={"training": {"_target_": target}})
-    with pytest.raises(ValueError, match=r"codec\.training\._target_ must be one of vlgs\.codec"):
+    bad = config(head={"training": {"_target_": target}})
+    with pytest.raises(ValueError, match=r"head\.training\._target_ must be one of vlgs\.head"):
         check_targets(bad)
 
 

@@ -131,7 +131,7 @@ def test_one_word_in_two_spellings_is_a_warning(tiny_scene: Scene):
 
 
 def test_memory_of_a_run_is_told_and_doubted():
-    line, found = training_memory(construct(composed("gaussians.max_count=1000", "codec.dim=3")))
+    line, found = training_memory(construct(composed("gaussians.max_count=1000", "head.dim=3")))
     assert line.startswith("training    1 MiB for 1000 Gaussians")  # 63 x 16 bytes each
     assert not found
     _, found = training_memory(construct(composed("gaussians.max_count=1000000000")))

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from vlgs.codec.identity import Identity
 from vlgs.fields.cloud import HIGHEST_LOGIT, point_cloud
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
@@ -13,6 +12,7 @@ from vlgs.fusion.mlp import MLP
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import view_color
 from vlgs.geometry import camera_center
+from vlgs.heads.identity import Identity
 from vlgs.indicator import ColourOpacity, Fixed, Indicator, Learned
 from vlgs.types import Camera, RasterConfig
 

@@ -290,7 +290,7 @@ def test_bad_sizes_are_refused(build, monkeypatch: pytest.MonkeyPatch):
         build(3, 0)
     with pytest.raises(ValueError, match="must be positive"):
         build(3, 3, heads=-1)
-    with pytest.raises(ValueError, match=r"<= 64.*codec=autoencoder.*got 3 \+ 512"):
+    with pytest.raises(ValueError, match=r"<= 64.*head=autoencoder.*got 3 \+ 512"):
         build(3, 512)
     with pytest.raises(ValueError, match="init must be 'zero' or 'xavier', got 'ones'"):
         build(3, 3, init="ones")

@@ -13,12 +13,12 @@ CONF = Path(__file__).parents[2] / "conf" / "fusion"
 
 
 @pytest.mark.parametrize("option", ["self", "none", "mlp", "cross"])
-@pytest.mark.parametrize("codec_dim", [1, 3, 16])
+@pytest.mark.parametrize("head_dim", [1, 3, 16])
 @pytest.mark.parametrize(("levels", "codes"), [("single", 1), ("separate", 1), ("joint", 3)])
-def test_option_takes_the_width_of_the_codes(option: str, codec_dim: int, levels: str, codes: int):
+def test_option_takes_the_width_of_the_codes(option: str, head_dim: int, levels: str, codes: int):
     fusion = OmegaConf.load(CONF / f"{option}.yaml")
-    cfg = OmegaConf.create({"codec": {"dim": codec_dim}, "levels": levels, "fusion": fusion})
-    color, feature = torch.rand(5, 3), torch.randn(5, codes * codec_dim)
+    cfg = OmegaConf.create({"head": {"dim": head_dim}, "levels": levels, "fusion": fusion})
+    color, feature = torch.rand(5, 3), torch.randn(5, codes * head_dim)
     fused = instantiate(cfg.fusion)(color, feature)
     assert torch.equal(fused[0], color)
     assert torch.equal(fused[1], feature)

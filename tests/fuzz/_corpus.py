@@ -14,12 +14,12 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from vlgs.check import check
-from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert
 from vlgs.data.faults import SceneError, errors
 from vlgs.features.encoders import DenseMaps
 from vlgs.features.folder import FeatureFolder
 from vlgs.features.weights import Pretrained
+from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.vocabulary import read_words
 
 WIDTH, HEIGHT, WIDE = 24, 18, 8
@@ -72,7 +72,7 @@ def write_corpus(folder: Path) -> list[Honest]:
         "maps": (_feature_map, read_feature_map, True),
         "settings": (_settings, _read_settings, False),
         "processor": (_processor, _read_processor, True),
-        "codec_cache": (_codec_cache, _fit_from_cache, True),
+        "head_cache": (_head_cache, _fit_from_cache, True),
         "photographs_cache": (_photograph_from_cache, _photograph_from_cache, True),
     }
     found = []
@@ -247,14 +247,14 @@ def _checkpoint(values: int) -> Callable[[Path], None]:
     return write
 
 
-def _codec(root: Path | None) -> Autoencoder:
+def _head(root: Path | None) -> Autoencoder:
     training = AutoencoderTraining(steps=2, batch=2)
     return Autoencoder(
         encoder_widths=(6, 4), decoder_widths=(4, 6), training=training, cache_dir=root
     )
 
 
-def _codec_cache(root: Path) -> None:
+def _head_cache(root: Path) -> None:
     _fit_from_cache(root)
 
 
@@ -262,9 +262,9 @@ def _fit_from_cache(root: Path) -> None:
     """Whatever the cache holds, the weights are those of a fit."""
     import torch
 
-    found, fitted = _codec(root), _codec(None)
-    for codec in (found, fitted):
-        codec.fit(torch.eye(WIDE), torch.ones(WIDE))
+    found, fitted = _head(root), _head(None)
+    for head in (found, fitted):
+        head.fit(torch.eye(WIDE), torch.ones(WIDE))
     wanted = fitted.state_dict()
     assert all(torch.equal(value, wanted[key]) for key, value in found.state_dict().items())
 
@@ -284,7 +284,7 @@ def _photograph_from_cache(root: Path) -> None:
 
 
 def _weights(root: Path) -> None:
-    _codec_cache(root)
+    _head_cache(root)
     next(root.glob("*.safetensors")).rename(root / "w.safetensors")
 
 

@@ -25,7 +25,7 @@ COMMANDS = {"check": check.command, "run": run.command}
 
 TINY = (
     *("data.width=24", "data.height=18", "data.train_views=3", "data.test_views=1"),
-    *("data.points=60", "data.cache=null", "codec.cache_dir=null", "codec.training.steps=2"),
+    *("data.points=60", "data.cache=null", "head.cache_dir=null", "head.training.steps=2"),
     *("trainer=smoke", "trainer.iterations=2", "progress=false", "pictures=false", "threads=1"),
 )
 """A procedural scene and a run of two steps: a second."""

@@ -120,7 +120,7 @@ WRONG = (
     ("data=mipnerf360_goi data.root=x data.scene=garden", "data.release.labels"),
     ("data=mipnerf360 data.root=x data.scene=nowhere", "data.images"),
     ("gaussians.init=nowhere.ply", "nowhere.ply"),
-    ("codec.weights=nowhere.pth", "nowhere.pth"),
+    ("head.weights=nowhere.pth", "nowhere.pth"),
     ("gaussians.color=red", "color"),
     ("gaussians.prune_on=both", "prune_on"),
     ("gaussians.init_features=random", "init_features"),
@@ -133,12 +133,16 @@ WRONG = (
     ("trainer.freeze=means", "freeze"),
     ("trainer.freeze=[everything]", "freeze"),
     ("trainer.freeze=[1]", "freeze"),
-    ("codec.encoder_widths=[]", "width"),
-    ("codec.encoder_widths=[0]", "width"),
-    ("codec.encoder_widths=[a]", "encoder_widths"),
-    ("codec.training=null", "training"),
-    ("codec=identity codec.dim=3", "dim"),
-    ("codec=identity fusion=self", "color_dim"),
+    ("head.encoder_widths=[]", "width"),
+    ("head.encoder_widths=[0]", "width"),
+    ("head.encoder_widths=[a]", "encoder_widths"),
+    ("head.training=null", "training"),
+    ("head=identity head.dim=3", "dim"),
+    ("head=identity fusion=self", "color_dim"),
+    ("head=linear fusion=self", "color_dim"),
+    ("head=linear fusion=none head.width=7", "width"),
+    ("codec=identity", "head"),
+    ("codec.training.steps=3", "head.training.steps"),
     ("fusion=self fusion.init=ones", "init"),
     ("indicator=per_level", "levels"),
     ("indicator=fixed indicator.value=2", "value"),
@@ -194,7 +198,13 @@ GOOD = (
         "protocol=select3d",
     ),
     *("sharing=none fusion=none", "sharing=lifted fusion=none indicator=opacity", "sharing=pos"),
-    *("++seed=3", "blend=fixed blend.value=1", "codec=identity fusion=none", "query=vocab_softmax"),
+    *(
+        "++seed=3",
+        "blend=fixed blend.value=1",
+        "head=identity fusion=none",
+        "head=linear fusion=none",
+        "query=vocab_softmax",
+    ),
     *(
         "augment=offline augment.views=1",
         "logger.loggers=[]",
@@ -242,14 +252,14 @@ def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
 def _tiny(arguments: list[str]) -> list[str]:
     """The arguments on the smallest scene; another data set has other keys."""
     elsewhere = any(a.startswith("data=") and a != "data=synthetic" for a in arguments)
-    identity = any(a.startswith("codec=identity") for a in arguments)
+    other = any(a.startswith(("head=identity", "head=linear")) for a in arguments)
     given = {a.lstrip("+~").partition("=")[0] for a in arguments}
     return [
         a
         for a in TINY
         if a.partition("=")[0] not in given
         and not (elsewhere and a.startswith("data."))
-        and not (identity and a.startswith("codec."))
+        and not (other and a.startswith("head."))
     ] + list(arguments)
 
 

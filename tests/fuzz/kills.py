@@ -39,7 +39,7 @@ VOLATILE = ("train_seconds", "fps_color", "fps_language", "fps_query", "peak_rss
 """Entries of metrics.json that differ between two runs: times, memory, and texts that name times."""
 OVERRIDES = (
     "trainer=smoke", "trainer.iterations=9", "trainer.checkpoint_every=3", "trainer.log_every=2",
-    "gaussians.densify={start: 2, stop: 8, every: 3, reset_every: 0}", "codec.training.steps=5",
+    "gaussians.densify={start: 2, stop: 8, every: 3, reset_every: 0}", "head.training.steps=5",
     "data.width=24", "data.height=18", "data.train_views=3", "data.test_views=1", "data.points=60",
     "progress=false", "threads=1", "fusion=self",
 )  # fmt: skip

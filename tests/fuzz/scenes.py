@@ -17,7 +17,7 @@ from vlgs.command import check_command
 
 NEGATIVES = ("object", "things", "stuff", "texture")
 OPTIONS = (
-    *("data=colmap", "data.every=3", "codec.cache_dir=null", "codec.training.steps=2", "threads=1"),
+    *("data=colmap", "data.every=3", "head.cache_dir=null", "head.training.steps=2", "threads=1"),
     *("trainer=smoke", "trainer.iterations=2", "progress=false", "pictures=false"),
 )
 PICTURES = ("pictures=true",)
@@ -144,8 +144,8 @@ def cases() -> list[Case]:
         Case("names in folders", replace(sound, names=tuple(f"left/{i}.png" for i in range(6))), False),
         Case("a name that leaves", replace(sound, names=("../a.png", "b.png", "c.png")), True, "below"),
         Case("resized to nothing", sound, None, "", ("data.resize=0.001",)),
-        Case("other data's autoencoder dim", sound, False, "", ("codec.dim=7",)),
-        Case("identity codec of another width", sound, True, "embedding width", ("codec=identity", "fusion=none")),
+        Case("other data's autoencoder dim", sound, False, "", ("head.dim=7",)),
+        Case("identity head of another width", sound, True, "embedding width", ("head=identity", "fusion=none")),
         Case("no folder", _spoilt(_remove), True, "got no"),
         Case("sharing none", sound, False, "", ("sharing=none", "fusion=none")),
         Case("lifted", sound, False, "", ("sharing=lifted", "fusion=none", "indicator=opacity")),
@@ -203,8 +203,8 @@ def _call(folder: Path, case: Case) -> Callable[[], None]:
     def call() -> None:
         root = folder / "scène"
         write(root, case.scene)
-        own = "codec=identity" in case.options  # which has no cache and no training
-        given = [o for o in OPTIONS if not (own and o.startswith("codec."))]
+        own = "head=identity" in case.options  # which has no cache and no training
+        given = [o for o in OPTIONS if not (own and o.startswith("head."))]
         checked, ran = both([*given, *case.options, f"data.root='{root}'"], folder / "results")
         refused = ran.status not in (0, 3)
         assert not (refused and case.refused is False), f"refused: {ran.error}"

@@ -53,7 +53,7 @@ NO_NAMES = (
 
 PLACES = (
     *("data", "data.faults", "gaussians", "gaussians.densify", "sharing", "augment", "fusion"),
-    *("indicator", "blend", "codec", "codec.training", "loss", "raster", "trainer", "trainer.skip"),
+    *("indicator", "blend", "head", "head.training", "loss", "raster", "trainer", "trainer.skip"),
     *("trainer.learning_rates", "text", "query", "protocol"),
 )
 """Keys that have a part in the default configuration."""
@@ -81,7 +81,7 @@ SMUGGLED = (
     ("+data.extra.deep.deeper._target_=os.system",),
     ("data.faults={_target_:os.system}",),
     ("data.faults.noise={_target_:evil_lab.strike}",),
-    ("codec.encoder_widths=[{_target_:evil_lab.strike}]",),
+    ("head.encoder_widths=[{_target_:evil_lab.strike}]",),
     ("query.negatives=[{_target_:evil_lab.strike}]",),
     ("logger.loggers=[{_target_:os.system}]",),
     ("logger.loggers=[{_target_:evil_lab.strike}]",),

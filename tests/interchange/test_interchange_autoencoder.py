@@ -8,9 +8,9 @@ import torch
 from torch import nn
 from torch.nn.functional import normalize
 
-from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert
 from vlgs.data.language import find_mask_files, read_mask_ids, read_mask_vectors, write_mask_files
+from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.interchange import (
     compress_language,
     load_weights,
@@ -67,35 +67,35 @@ def embeddings(n: int = 40) -> torch.Tensor:
 def test_langsplats_weights_give_langsplats_codes(tmp_path: Path):
     net = trained()
     torch.save(net.state_dict(), tmp_path / "best_ckpt.pth")
-    codec = read_autoencoder(tmp_path / "best_ckpt.pth")
-    assert (codec.dim, codec.encoder_widths) == (3, (256, 128, 64, 32))
-    assert codec.decoder_widths == (16, 32, 64, 128, 256, 256)
+    head = read_autoencoder(tmp_path / "best_ckpt.pth")
+    assert (head.dim, head.encoder_widths) == (3, (256, 128, 64, 32))
+    assert head.decoder_widths == (16, 32, 64, 128, 256, 256)
     x = embeddings()
     with torch.no_grad():
-        assert torch.equal(codec.encode(x), net.encode(x))
+        assert torch.equal(head.encode(x), net.encode(x))
         codes = torch.randn(7, 3)  # blends of codes are not normalised before decoding
-        assert torch.equal(codec.decode(codes), net.decode(codes))
+        assert torch.equal(head.decode(codes), net.decode(codes))
 
 
 @pytest.mark.parametrize("center", [False, True])
 def test_our_weights_are_langsplats(tmp_path: Path, center: bool):
-    codec = Autoencoder(center=center, training=AutoencoderTraining(steps=20))
+    head = Autoencoder(center=center, training=AutoencoderTraining(steps=20))
     x = embeddings()
-    codec.fit(x, torch.ones(len(x)))
-    write_autoencoder(tmp_path / "best_ckpt.pth", codec)
+    head.fit(x, torch.ones(len(x)))
+    write_autoencoder(tmp_path / "best_ckpt.pth", head)
     net = LangSplats().eval()
     net.load_state_dict(torch.load(tmp_path / "best_ckpt.pth", weights_only=True))  # strict
     with torch.no_grad():
         # The mean moves into the biases: 512 products summed in another order.
-        torch.testing.assert_close(net.encode(x), codec.encode(x), atol=2e-5, rtol=0)
-        codes = codec.encode(x)
-        torch.testing.assert_close(net.decode(codes), codec.decode(codes), atol=2e-6, rtol=0)
+        torch.testing.assert_close(net.encode(x), head.encode(x), atol=2e-5, rtol=0)
+        codes = head.encode(x)
+        torch.testing.assert_close(net.decode(codes), head.decode(codes), atol=2e-6, rtol=0)
 
 
 def test_other_widths_and_our_own_file_come_back(tmp_path: Path):
-    codec = Autoencoder(4, (32,), (16, 8), training=AutoencoderTraining(steps=20))
-    codec.fit(embeddings(), torch.ones(40))
-    write_autoencoder(tmp_path / "a.pth", codec)
+    head = Autoencoder(4, (32,), (16, 8), training=AutoencoderTraining(steps=20))
+    head.fit(embeddings(), torch.ones(40))
+    write_autoencoder(tmp_path / "a.pth", head)
     convert(tmp_path / "a.pth", tmp_path / "a.safetensors")
     back = read_autoencoder(tmp_path / "a.safetensors")
     assert (back.dim, back.encoder_widths, back.decoder_widths) == (4, (32,), (16, 8))
@@ -105,13 +105,13 @@ def test_other_widths_and_our_own_file_come_back(tmp_path: Path):
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
-def test_a_codec_takes_weights_in_place_of_a_fit(tmp_path: Path):
+def test_a_head_takes_weights_in_place_of_a_fit(tmp_path: Path):
     net = trained()
     torch.save(net.state_dict(), tmp_path / "best_ckpt.pth")
-    codec = Autoencoder(weights=str(tmp_path / "best_ckpt.pth"))
-    load_weights(codec, tmp_path / "best_ckpt.pth")
+    head = Autoencoder(weights=str(tmp_path / "best_ckpt.pth"))
+    load_weights(head, tmp_path / "best_ckpt.pth")
     with torch.no_grad():
-        assert torch.equal(codec.encode(embeddings()), net.encode(embeddings()))
+        assert torch.equal(head.encode(embeddings()), net.encode(embeddings()))
     with pytest.raises(
         ValueError, match=r"widths must be \(\(8,\), 3, \(8,\)\) as configured, got"
     ):
@@ -170,7 +170,7 @@ def test_language_maps_become_dim3(tmp_path: Path):
     views = {stem: write_view(source, stem) for stem in ("frame_00001", "frame_00002")}
     net = trained()
     torch.save(net.state_dict(), tmp_path / "best_ckpt.pth")
-    (line,) = convert(source, target, codec=tmp_path / "best_ckpt.pth")
+    (line,) = convert(source, target, head=tmp_path / "best_ckpt.pth")
     assert line.endswith("language codes of 2 views")
     for stem, (ids, vectors) in views.items():
         np.testing.assert_array_equal(np.load(target / f"{stem}_s.npy"), ids)
@@ -183,15 +183,15 @@ def test_language_maps_become_dim3(tmp_path: Path):
 
 
 def test_faults_of_language_folders(tmp_path: Path):
-    codec = Autoencoder(3, (8,), (8,), training=AutoencoderTraining(steps=20))
-    codec.fit(normalize(torch.randn(9, 16), dim=1), torch.ones(9))
+    head = Autoencoder(3, (8,), (8,), training=AutoencoderTraining(steps=20))
+    head.fit(normalize(torch.randn(9, 16), dim=1), torch.ones(9))
     with pytest.raises(
         FileNotFoundError, match=r"must hold <stem>_s\.npy and <stem>_f\.npy, got nothing"
     ):
-        compress_language(tmp_path, tmp_path / "out", codec)
+        compress_language(tmp_path, tmp_path / "out", head)
     write_view(tmp_path, "a")
     with pytest.raises(ValueError, match="vectors must be as wide as the autoencoder's input"):
-        compress_language(tmp_path, tmp_path / "out", codec)
+        compress_language(tmp_path, tmp_path / "out", head)
     (tmp_path / "a_f.npy").unlink()
     with pytest.raises(FileNotFoundError, match="got a of it"):
-        compress_language(tmp_path, tmp_path / "out", codec)
+        compress_language(tmp_path, tmp_path / "out", head)

@@ -7,8 +7,6 @@ import pytest
 import torch
 from tiny_runs import TINY, composed
 
-from vlgs.codec import Codec
-from vlgs.codec.identity import Identity
 from vlgs.config import instantiate
 from vlgs.fields import HasGaussians
 from vlgs.fields.trained import SplatField
@@ -16,6 +14,8 @@ from vlgs.gaussians import densify, read_ply, write_ply
 from vlgs.gaussians.densify import DensifyState
 from vlgs.gaussians.logistic import logit
 from vlgs.gaussians.parameters import at_levels
+from vlgs.heads import Head
+from vlgs.heads.identity import Identity
 from vlgs.module.build import Parts, bind, build_module
 from vlgs.module.fit import FitOptions, fit
 from vlgs.module.joint import join_levels
@@ -39,13 +39,13 @@ def scenes() -> list[Scene]:
     return [at(level) for level in (1, 2, 3)]
 
 
-def module_of(scene: Scene, *overrides: str, codec: Codec | None = None) -> VLGSModule:
+def module_of(scene: Scene, *overrides: str, head: Head | None = None) -> VLGSModule:
     levels = () if scene.mask_levels == 1 else ("levels=joint",)
     config = composed(*TINY, *levels, "trainer=smoke", "trainer.iterations=24", *overrides)
     torch.manual_seed(0)
     parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
-    if codec is not None:
-        parts = replace(parts, codec=codec)
+    if head is not None:
+        parts = replace(parts, head=head)
     return build_module(scene, parts, seed=0)
 
 
@@ -68,7 +68,7 @@ def with_masks_at(scenes: list[Scene], level: int) -> list[Scene]:
 def stirred(module: VLGSModule) -> VLGSModule:
     """Away from the start, where codes are zero; the same draws for whatever is there."""
     draws = torch.Generator().manual_seed(3)
-    codes = torch.randn(module.model.count, module.model.codec.dim, generator=draws)
+    codes = torch.randn(module.model.count, module.model.head.dim, generator=draws)
     module.model.splats["features"].copy_(codes.repeat(1, module.model.levels))
     weights = torch.randn(module.model.count, generator=draws)
     log_scales = module.model.splats["log_scales"]  # rotations of a sphere have no gradient
@@ -150,8 +150,8 @@ def test_three_equal_levels_are_one_model(scenes: list[Scene], indicator: str):
     options = ("fusion=none", "blend=fixed")
     one = stirred(module_of(scenes[2], *options))
     three = stirred(module_of(join_levels([scenes[2]] * 3), *options, f"indicator={indicator}"))
-    # The codecs were fitted to one set of vectors, listed once and thrice.
-    three.model.codec.load_state_dict(one.model.codec.state_dict())  # type: ignore[operator]
+    # The heads were fitted to one set of vectors, listed once and thrice.
+    three.model.head.load_state_dict(one.model.head.state_dict())  # type: ignore[operator]
     given, skip = three.step.setup, three.settings.skip
     setup = bind(given.objectives, given.views.scene, three.model, given.blend, skip, 0)
     three.step.setup = setup
@@ -186,7 +186,7 @@ def test_a_level_is_rendered_and_asked_as_if_it_were_alone(scenes: list[Scene]):
             model.splats["features"].add_(torch.arange(9) * 0.1)  # levels differ
             whole = model.render(camera)
             assert whole.feature is not None
-        field, words = SplatField(model), model.codec.decode(torch.randn(4, 3))
+        field, words = SplatField(model), model.head.decode(torch.randn(4, 3))
         together = field.render(camera, frozenset({"color", "feature"}))
         for level, alone in enumerate(field.levels()):
             image = alone.render(camera, frozenset({"color", "alpha", "feature"}))
@@ -248,10 +248,10 @@ def test_training_learns_every_level(scenes: list[Scene], tmp_path: Path):
 
 
 def test_codes_are_lifted_level_by_level(scenes: list[Scene]):
-    options, codec = ("fusion=none", "gaussians.init_features=lifted"), Identity(512)
-    alone = [module_of(scene, *options, codec=codec).model.splats["features"] for scene in scenes]
+    options, head = ("fusion=none", "gaussians.init_features=lifted"), Identity(512)
+    alone = [module_of(scene, *options, head=head).model.splats["features"] for scene in scenes]
     for indicator in ("learned", "per_level"):
-        joint = module_of(join_levels(scenes), *options, f"indicator={indicator}", codec=codec)
+        joint = module_of(join_levels(scenes), *options, f"indicator={indicator}", head=head)
         got = joint.model.splats["features"].unflatten(1, (3, 512))
         torch.testing.assert_close(got, torch.stack(alone, dim=1), rtol=1e-5, atol=1e-6)
 

@@ -13,10 +13,10 @@ from plyfile import PlyData, PlyElement
 from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 
-from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.convert import convert, main
 from vlgs.gaussians import STANDARD, read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN
+from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.interchange import write_autoencoder
 from vlgs.run import run
 from vlgs.types import Scene
@@ -173,10 +173,10 @@ def test_a_run_starts_from_a_file_and_its_content_is_part_of_the_id(tmp_path: Pa
 
 
 def test_a_run_takes_the_weights_of_an_autoencoder(tmp_path: Path, tiny_scene: Scene):
-    codec = Autoencoder(training=AutoencoderTraining(steps=20))
-    codec.fit(tiny_scene.mask_vectors, tiny_scene.mask_areas)
-    write_autoencoder(tmp_path / "best_ckpt.pth", codec)
-    weights = f"codec.weights={tmp_path / 'best_ckpt.pth'}"
+    head = Autoencoder(training=AutoencoderTraining(steps=20))
+    head.fit(tiny_scene.mask_vectors, tiny_scene.mask_areas)
+    write_autoencoder(tmp_path / "best_ckpt.pth", head)
+    weights = f"head.weights={tmp_path / 'best_ckpt.pth'}"
     options = [
         *TINY,
         f"results={tmp_path}",
@@ -187,7 +187,7 @@ def test_a_run_takes_the_weights_of_an_autoencoder(tmp_path: Path, tiny_scene: S
     assert run(composed(*options, weights)) == 0
     (folder,) = (tmp_path / "runs").iterdir()
     (saved,) = (folder / "checkpoint").glob("*.safetensors")
-    kept = load_file(saved)["model.codec.encoder.0.weight"]
-    assert torch.equal(kept, codec.state_dict()["encoder.0.weight"])
+    kept = load_file(saved)["model.head.encoder.0.weight"]
+    assert torch.equal(kept, head.state_dict()["encoder.0.weight"])
     with pytest.raises(FileNotFoundError, match="weights must be a file"):
-        run(composed(*options, "codec.weights=nowhere.pth"))
+        run(composed(*options, "head.weights=nowhere.pth"))

@@ -24,7 +24,7 @@ from vlgs.runs import STOPPED, RunFolder
 
 SHORT = (
     *(*TINY, "trainer=smoke", "trainer.iterations=9", "trainer.checkpoint_every=3"),
-    *("trainer.log_every=2", "pictures=false", "threads=1", "codec.training.steps=5"),
+    *("trainer.log_every=2", "pictures=false", "threads=1", "head.training.steps=5"),
     *("data.width=24", "data.height=18", "data.train_views=3", "data.test_views=1"),
     *("data.points=60", "protocol=dense"),
 )

@@ -15,7 +15,7 @@ from vlgs.runs import RunFolder
 
 SHORT = (
     *(*TINY, "trainer=smoke", "trainer.iterations=9", "trainer.checkpoint_every=3"),
-    *("pictures=false", "threads=1", "codec.training.steps=5", "data.width=24", "data.height=18"),
+    *("pictures=false", "threads=1", "head.training.steps=5", "data.width=24", "data.height=18"),
     *("data.train_views=3", "data.test_views=1", "data.points=60", "protocol=dense"),
 )
 MEASURED = ("seconds", "fps", "bytes", "machine", "skips", "commit")
@@ -46,7 +46,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 def test_settings_that_are_no_part_of_an_id_move_nothing(whole: RunFolder, tmp_path: Path):
     others = (
         *("trainer.log_every=2", "trainer.checkpoint_every=4", "raster.memory_budget=100000000"),
-        *("data.cache=null", f"codec.cache_dir={tmp_path}/codec", "threads=2", "progress=true"),
+        *("data.cache=null", f"head.cache_dir={tmp_path}/head", "threads=2", "progress=true"),
         *("pictures=true", "on_existing=refuse", f"results={tmp_path}/elsewhere"),
     )
     assert run(composed(*SHORT, *others)) == 0

@@ -20,8 +20,6 @@ from torch.autograd import gradcheck
 from tests.stress.splats import SMOOTH, make_splats
 from vlgs.blend import FixedBlend, blend_targets
 from vlgs.blend.pose import slerp
-from vlgs.codec.autoencoder import Autoencoder
-from vlgs.codec.identity import Identity
 from vlgs.fields.similarity import cosines, decoded_cosines
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
@@ -32,6 +30,9 @@ from vlgs.gaussians.logistic import logistic
 from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
+from vlgs.heads.autoencoder import Autoencoder
+from vlgs.heads.identity import Identity
+from vlgs.heads.linear import Linear
 from vlgs.indicator import ColourOpacity, Learned, PerLevel
 from vlgs.losses import (
     l1_dssim,
@@ -52,21 +53,28 @@ from vlgs.ops.view_color import view_color
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
-AREAS = ("ops", "fields", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "codec", "query", "indicator")  # fmt: skip
+AREAS = ("ops", "fields", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "heads", "query", "indicator")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {
     "vlgs.fusion.Fusion.__call__": "protocol",
-    "vlgs.codec.Codec.encode": "protocol",
-    "vlgs.codec.Codec.decode": "protocol",
     **{f"vlgs.objectives.{name}": "adds up the losses and renders that are checked" for name in (
         "objective.Objective.__call__", "photometric.Photometric.__call__", "language.Language.__call__",
         "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss",
     )},
     "vlgs.objectives.targets.covered": "a mask",
+    "vlgs.heads.Head.targets": "protocol",
+    "vlgs.heads.Head.predict": "protocol",
+    "vlgs.heads.Head.decode": "protocol",
     "vlgs.gaussians.parameters.at_levels": "before training",
     "vlgs.gaussians.parameters.complete": "before training",
     "vlgs.gaussians.parameters.conform": "before training",
+    "vlgs.objectives.objective.Objective.__call__": "protocol",
+    **{f"vlgs.objectives.{name}": "adds up errors that are checked" for name in (
+        "photometric.Photometric.__call__", "language.Language.__call__",
+        "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss",
+    )},
+    "vlgs.objectives.targets.covered": "a mask",
     "vlgs.query.Query.relevancy": "protocol",
     "vlgs.query.Query.__call__": "protocol",
     "vlgs.query.text.TextEncoder.encode": "protocol",
@@ -219,7 +227,19 @@ def fuse(module: torch.nn.Module) -> Check:
     return run, [draw(3, 2), draw(3, 2, seed=1), *(p.detach() for p in module.parameters())]
 
 
-def codec() -> Autoencoder:
+def linear_head(name: str) -> Check:
+    """By codes, weights and biases."""
+    made = Linear(dim=3, width=4).double()
+    del made.map  # its weights are inputs here
+
+    def run(x: Tensor, weight: Tensor, bias: Tensor):
+        made.__dict__["map"] = partial(torch.nn.functional.linear, weight=weight, bias=bias)
+        return getattr(made, name)(x)
+
+    return run, [draw(2, 3, 3), draw(4, 3, seed=1), draw(4, seed=2)]
+
+
+def head() -> Autoencoder:
     made = Autoencoder(dim=3, encoder_widths=(8, 6), decoder_widths=(6, 8))
     torch.manual_seed(0)
     made.build(5)
@@ -294,6 +314,10 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.fusion.attention.SelfAttention.forward of two heads": lambda: fuse(SelfAttention(2, 2, 1, 2, "xavier")),
     "vlgs.fusion.attention.CrossAttention.forward of two heads": lambda: fuse(CrossAttention(2, 2, 1, 2, "xavier")),
     "vlgs.fusion.mlp.MLP.forward": lambda: fuse(MLP(2, 2, residual=False)),
+    "vlgs.heads.linear.Linear.targets": lambda: (Linear(2, 3).targets, [draw(4, 3)]),
+    "vlgs.heads.linear.Linear.predict": lambda: linear_head("predict"),
+    "vlgs.heads.linear.Linear.decode": lambda: linear_head("decode"),
+    "vlgs.fields.splat.SplatModel.predict": lambda: model(lambda m: m.predict(m.render(view()).feature)),  # type: ignore[arg-type]
     "vlgs.fusion.blocks.to_blocks": lambda: (lambda x: to_blocks(x)[:, :, :3], [draw(3, 2)]),
     "vlgs.fusion.blocks.from_blocks": lambda: (lambda x: from_blocks(x.expand(2, 2, BLOCK), 3), [draw(2, 2, 1)]),
     "vlgs.fusion.blocks.linear": lambda: (partial(linear, LAYER), [draw(2, 2, 4)]),
@@ -303,10 +327,13 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.gaussians.sh.sh_to_rgb": lambda: (sh_to_rgb, [draw(4, 3)]),
     "vlgs.gaussians.sh.rgb_to_sh": lambda: (rgb_to_sh, [draw(4, 3)]),
     **{f"vlgs.ops.view_color.view_color of degree {degree}": partial(coloring, degree) for degree in range(4)},
-    "vlgs.codec.autoencoder.Autoencoder.encode": lambda: (codec().encode, [draw(3, 5)]),
-    "vlgs.codec.autoencoder.Autoencoder.decode": lambda: (codec().decode, [draw(3, 3)]),
-    "vlgs.codec.identity.Identity.encode": lambda: (Identity(3).encode, [draw(4, 3)]),
-    "vlgs.codec.identity.Identity.decode": lambda: (Identity(3).decode, [draw(4, 3)]),
+    "vlgs.heads.autoencoder.Autoencoder.encode": lambda: (head().encode, [draw(3, 5)]),
+    "vlgs.heads.autoencoder.Autoencoder.decode": lambda: (head().decode, [draw(3, 3)]),
+    "vlgs.heads.autoencoder.Autoencoder.targets": lambda: (head().targets, [draw(3, 5)]),
+    "vlgs.heads.autoencoder.Autoencoder.predict": lambda: (head().predict, [draw(3, 3)]),
+    "vlgs.heads.identity.Identity.targets": lambda: (Identity(3).targets, [draw(4, 3)]),
+    "vlgs.heads.identity.Identity.predict": lambda: (Identity(3).predict, [draw(4, 3)]),
+    "vlgs.heads.identity.Identity.decode": lambda: (Identity(3).decode, [draw(4, 3)]),
     "vlgs.fields.similarity.cosines": lambda: (cosines, [draw(4, 3), draw(2, 3, seed=1)]),
     "vlgs.fields.similarity.decoded_cosines": lambda: (
         lambda c, t: decoded_cosines(Identity(3).decode, c, t, chunk=4), [draw(3, 2, 3), draw(2, 3, seed=1)]

@@ -27,7 +27,7 @@ from vlgs.ops.rasterize import rasterize
 from vlgs.runs import RunFolder
 from vlgs.types import ChannelGroup, Scene
 
-TINY = ("codec.training.steps=30", "codec.cache_dir=null", "trainer=smoke")
+TINY = ("head.training.steps=30", "head.cache_dir=null", "trainer=smoke")
 RATES = ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits", "indicator_logits",
          "features", "fusion")  # fmt: skip
 

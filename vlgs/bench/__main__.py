@@ -55,7 +55,7 @@ def error(parser: ArgumentParser) -> Runner:
             trained = train_or_load([f"seed={args.seed}"], Path("results"))
         stepping = trained
         if args.quick and not args.no_trained and trained is None:
-            stepping = train_a_little([*QUICK, "codec.cache_dir=null", f"seed={args.seed}"])
+            stepping = train_a_little([*QUICK, "head.cache_dir=null", f"seed={args.seed}"])
         scenes = make_scenes(sizes, trained, args.seed)
         repeats = 3 if args.quick else args.repeats
         broken = run_error(scenes, trained, args.threads, repeats, args.out, args.seed, stepping)

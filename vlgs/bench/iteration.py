@@ -24,8 +24,8 @@ KERNELS = ("project", "blend", "fusion", "Adam")
 
 OVERRIDES = (
     "data.test_views=2",
-    "codec.training.steps=20",
-    "codec.cache_dir=null",
+    "head.training.steps=20",
+    "head.cache_dir=null",
     "gaussians.densify.stop=0",
 )
 

@@ -14,8 +14,8 @@ from vlgs.runs import RunFolder
 OVERRIDES = (
     "data.train_views=8",
     "data.test_views=2",
-    "codec.training.steps=20",
-    "codec.cache_dir=null",
+    "head.training.steps=20",
+    "head.cache_dir=null",
     "gaussians.densify.stop=0",
     "trainer.checkpoint_every=0",
 )

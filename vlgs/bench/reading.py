@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 DISTINCT = 10
 """Photographs and maps of masks that differ; the others are further names of them, and are read and hashed like any other.
-The masks' vectors all differ: equal ones would make the codec's work less than it is."""
+The masks' vectors all differ: equal ones would make the head's work less than it is."""
 MASKS = (30, 120, 80, 40)
 """Masks of a photograph at the four levels."""
 POINTS = 50_000
 STEPS = 3
 
 
-Language = Literal["none", "codec fitted", "codec cached"]
-"""Whether there is language, and whether its codec, the first stage of training, is there from a run before."""
+Language = Literal["none", "head fitted", "head cached"]
+"""Whether there is language, and whether its head, the first stage of training, is there from a run before."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
                 write_photographs(root, images, size, language != "none", seed)
             started = time.time()
             with Child() as child:
-                for stage, *reached in child.call(stages, root, started, Path(scratch) / "codecs"):
+                for stage, *reached in child.call(stages, root, started, Path(scratch) / "heads"):
                     rows.append(Reached(language, images, *size, stage, *reached))
     write_sheet(out / "reading.csv", rows, header)
     show(
@@ -76,13 +76,13 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
     return rows
 
 
-def stages(root: Path, started: float, codecs: Path) -> list[tuple[str, float, float, float]]:
+def stages(root: Path, started: float, heads: Path) -> list[tuple[str, float, float, float]]:
     """What `python -m vlgs.run data=colmap data.root=ROOT trainer=photos` does up to its first steps.
 
     Args:
         root: Scene.
         started: `time.time()` at the start of this process.
-        codecs: Folder that fitted codecs are kept in.
+        heads: Folder that fitted heads are kept in.
 
     Returns:
         Stage, and from its wall seconds on the columns of `Reached`.
@@ -95,13 +95,13 @@ def stages(root: Path, started: float, codecs: Path) -> list[tuple[str, float, f
     def reach(stage: str) -> None:
         rows.append((stage, time.time() - started, time.process_time(), peak_mib()))
 
-    options = ["data=colmap", f"data.root={root}", "trainer=photos", f"codec.cache_dir={codecs}"]
+    options = ["data=colmap", f"data.root={root}", "trainer=photos", f"head.cache_dir={heads}"]
     experiment = construct(composed(options))
     reach("imports")
     scene = experiment.read_scene()
     reach("scene read")
     module = build(experiment, scene)
-    reach("Gaussians and codec")
+    reach("Gaussians and head")
     for stage, work in _training(module):
         work()
         reach(stage)

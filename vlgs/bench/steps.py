@@ -136,8 +136,8 @@ class _Pair:
         bounds = [self._bound(off) for _, off in sides]
         # The step that is nearest to its bound, or beyond.
         worst = max(range(len(sides)), key=lambda i: moved[i] - (bounds[i] or 0.0))
-        # Of the Gaussians and the fusion; the codec is not trained here.
-        names = [n for n, _ in self.off.model.named_parameters() if not n.startswith("codec.")]
+        # Of the Gaussians and the fusion; the head is not trained here.
+        names = [n for n, _ in self.off.model.named_parameters() if not n.startswith("head.")]
         return StepRow(
             scene, self.off.model.count, skip.name, skip.kind, skip.default, threads, len(sides),
             *times, repeats, self._kept_mib(), self.skipped, sides[worst][1].loss, moved[worst], bounds[worst],

@@ -30,7 +30,7 @@ from vlgs.skips import SKIPS, turn
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BASE = ("codec.cache_dir=null",)
+BASE = ("head.cache_dir=null",)
 
 
 def _skips(on: bool) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ RECIPES: dict[str, tuple[str, ...]] = {
 """Label -> overrides of `python -m vlgs.run`."""
 
 QUICK = ("data.width=48", "data.height=36", "data.train_views=6", "data.test_views=2", "data.points=400",
-         "codec.training.steps=30", "trainer=smoke")  # fmt: skip
+         "head.training.steps=30", "trainer=smoke")  # fmt: skip
 
 
 @dataclass(frozen=True)

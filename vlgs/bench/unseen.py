@@ -28,7 +28,7 @@ PHOTOGRAPHS = ("fox", "dtu_scan65", "camvid_0016E5")
 """Folders below `--root`; a folder that is not there is left out."""
 HELD_OUT = 8
 SIZE = ("data.width=120", "data.height=90")
-QUICK = ("data.width=48", "data.height=36", "data.points=400", "codec.training.steps=30", "trainer=smoke")  # fmt: skip
+QUICK = ("data.width=48", "data.height=36", "data.points=400", "head.training.steps=30", "trainer=smoke")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _row(
     known: Mapping[str, UnseenRow],
 ) -> UnseenRow | None:
     """Train and score, unless a row of this run is known."""
-    given = ["codec.cache_dir=null", *task.overrides, *overrides]
+    given = ["head.cache_dir=null", *task.overrides, *overrides]
     given += [f"seed={seed}", f"threads={threads}", "progress=false"]
     experiment = construct(composed(given))
     scene = experiment.read_scene()

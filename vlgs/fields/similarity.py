@@ -48,7 +48,7 @@ def decoded_cosines(
     here only `chunk` pixels are decoded at a time.
 
     Args:
-        decode: Codes ``[p, d]`` to embeddings ``[p, e]``, see `vlgs.codec.Codec.decode`.
+        decode: Codes ``[p, d]`` to embeddings ``[p, e]``, see `vlgs.heads.Head.decode`.
         codes: Rendered, not normalised.
         text: Text vectors in the embedding space of the decoder.
         chunk: Pixels per call of `decode`.

@@ -1,4 +1,4 @@
-"""A scene as a model: Gaussians, fusion, indicator and codec together, rendered from any camera."""
+"""A scene as a model: Gaussians, fusion, indicator and head together, rendered from any camera."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from vlgs.codec import Codec
 from vlgs.fusion import Fusion
 from vlgs.gaussians import STANDARD, Attributes, activate
 from vlgs.gaussians.sh import sh_to_rgb
 from vlgs.geometry import camera_center
+from vlgs.heads import Head
 from vlgs.indicator import Indicator
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.view_color import view_color
@@ -61,7 +61,7 @@ class SplatModel(nn.Module):
         parameters: Raw Gaussians, by the names of `attributes`.
         fusion: Mixes colour and language of each Gaussian (Eq. 5).
         indicator: Chooses what blends language (Eq. 6).
-        codec: Embedding to language code and back.
+        head: From language code to embedding.
         raster: Constants of the rasterizer.
         sh_degree: Highest spherical harmonics degree in use, 0 to 3.
         evaluated: Whether colour is fused as each view sees it, so that what is blended as language depends on the view
@@ -74,7 +74,7 @@ class SplatModel(nn.Module):
         parameters: dict[str, Tensor],
         fusion: Fusion,
         indicator: Indicator,
-        codec: Codec,
+        head: Head,
         raster: RasterConfig,
         sh_degree: int,
         evaluated: bool = False,
@@ -84,7 +84,7 @@ class SplatModel(nn.Module):
         self.splats = nn.ParameterDict({k: nn.Parameter(v) for k, v in parameters.items()})
         self.fusion = fusion
         self.indicator = indicator
-        self.codec = codec
+        self.head = head
         self.raster = raster
         self.sh_degree = sh_degree
         self.evaluated = evaluated
@@ -98,7 +98,7 @@ class SplatModel(nn.Module):
     @property
     def levels(self) -> int:
         """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``."""
-        return self.splats["features"].shape[1] // self.codec.dim
+        return self.splats["features"].shape[1] // self.head.dim
 
     def gaussians(self) -> Gaussians:
         """The Gaussians in natural units."""
@@ -185,6 +185,10 @@ class SplatModel(nn.Module):
         gaussians = self.gaussians()
         group = ChannelGroup(values, weight, shape=gaussians.language_shape)
         return self._rasterize(gaussians, [group], camera).images[0]
+
+    def predict(self, feature: Float[Tensor, "h w c"]) -> Float[Tensor, "h wl t"]:
+        """What a rendered map of codes is compared by (`Head.predict`); l mask levels stand beside each other in a row."""
+        return self.head.predict(feature.view(len(feature), -1, self.head.dim))
 
     def view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
         """RGB of every Gaussian as a camera sees it, >= 0."""

@@ -117,12 +117,12 @@ class SplatField:
 
     def _by_level(self, codes: Float[Tensor, "h w c"]) -> Float[Tensor, "levels h w d"]:
         """Codes of the levels apart, which the model has side by side."""
-        return _stack(codes.split(self.model.codec.dim, dim=-1))
+        return _stack(codes.split(self.model.head.dim, dim=-1))
 
     def _compare(
         self, codes: Float[Tensor, "levels h w d"], words: Float[Tensor, "k e"]
     ) -> Float[Tensor, "levels k h w"]:
-        decode = self.model.codec.decode
+        decode = self.model.head.decode
         return _stack([decoded_cosines(decode, level, words) for level in codes])
 
 

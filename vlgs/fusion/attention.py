@@ -133,7 +133,7 @@ def _require_sizes(who: str, color_dim: int, feature_dim: int, width: int, heads
     if color_dim + feature_dim > MAX_CHANNELS:
         raise ValueError(
             f"{who}: color_dim + feature_dim must be <= {MAX_CHANNELS}, because time grows with its square (use "
-            f"codec=autoencoder, or fusion=mlp or none), got {color_dim} + {feature_dim}"
+            f"head=autoencoder, or fusion=mlp or none), got {color_dim} + {feature_dim}"
         )
 
 

@@ -1,9 +1,10 @@
 """Settings of the Gaussians: how they start, multiply and die. Mirrored by conf/gaussians."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
+from vlgs.demands import Demand
 from vlgs.values import require_choice, require_range
 
 
@@ -146,6 +147,14 @@ class GaussiansConfig:
 
         further = {name: _attribute(name, extra) for name, extra in self.attributes.items()}
         object.__setattr__(self, "attributes", further)
+
+    @property
+    def demands(self) -> Sequence[Demand]:
+        """Codes are there to be lifted where the head is fitted before."""
+        if self.init_features == "zero":
+            return ()
+        why = "as codes of masks are lifted onto the Gaussians"
+        return (Demand("gaussians.init_features=lifted", "head", "untrained", why),)
 
     @property
     def degree(self) -> int:

@@ -1,4 +1,4 @@
-"""LangSplat's autoencoder weights (``best_ckpt.pth``) as our codec, and back."""
+"""LangSplat's autoencoder weights (``best_ckpt.pth``) as our head, and back."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -10,12 +10,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vlgs.codec.autoencoder import Autoencoder
+from vlgs.heads.autoencoder import Autoencoder
 from vlgs.interchange.plain import load_plain, save_plain
 
 
 def read_autoencoder(path: str | Path) -> Autoencoder:
-    """A codec with the weights of a ``best_ckpt.pth``, or of our own state dict as safetensors, whatever its widths.
+    """A head with the weights of a ``best_ckpt.pth``, or of our own state dict as safetensors, whatever its widths.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -33,11 +33,11 @@ def read_autoencoder(path: str | Path) -> Autoencoder:
         raise ValueError(f"{who}: {what}, got {len(encoder)} and {len(decoder)} widths")
     if encoder[-1] != decoder[0] or encoder[0] != decoder[-1]:
         raise ValueError(f"{who}: decoder must undo {encoder}, got {decoder}")
-    codec = Autoencoder(encoder[-1], encoder[1:-1], decoder[1:-1], center="mean" in state)
-    codec.build(encoder[0])
-    own = {"mean": codec.mean, "fitted_reconstruction": codec.fitted_reconstruction}
+    head = Autoencoder(encoder[-1], encoder[1:-1], decoder[1:-1], center="mean" in state)
+    head.build(encoder[0])
+    own = {"mean": head.mean, "fitted_reconstruction": head.fitted_reconstruction}
     try:
-        codec.load_state_dict({**own, **state})
+        head.load_state_dict({**own, **state})
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:300]
         raise ValueError(f"{who}: layers must be LangSplat's, got {reason}") from None
@@ -45,24 +45,24 @@ def read_autoencoder(path: str | Path) -> Autoencoder:
     bad = [name for name, value in weights if not value.isfinite().all()]
     if bad:
         raise ValueError(f"{who}: weights must be finite, got {bad[0]} that is not")
-    codec.requires_grad_(False)
-    return codec
+    head.requires_grad_(False)
+    return head
 
 
-def load_weights(codec: Autoencoder, path: str | Path) -> None:
-    """Give a codec the weights of a file, in place of a fit.
+def load_weights(head: Autoencoder, path: str | Path) -> None:
+    """Give a head the weights of a file, in place of a fit.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no autoencoder, or one of other widths.
     """
     read = read_autoencoder(path)
-    own = (codec.encoder_widths, codec.dim, codec.decoder_widths)
+    own = (head.encoder_widths, head.dim, head.decoder_widths)
     widths = (read.encoder_widths, read.dim, read.decoder_widths)
     if own != widths:
         raise ValueError(f"autoencoder {path}: widths must be {own} as configured, got {widths}")
-    codec.load_state_dict(read.state_dict())
-    codec.requires_grad_(False)
+    head.load_state_dict(read.state_dict())
+    head.requires_grad_(False)
 
 
 def _load(path: Path) -> Any:
@@ -76,19 +76,19 @@ def _load(path: Path) -> Any:
         raise ValueError(f"autoencoder {path}: must be safetensors, got {error}") from None
 
 
-def write_autoencoder(path: str | Path, codec: Autoencoder) -> None:
-    """Write a fitted codec as LangSplat reads it.
+def write_autoencoder(path: str | Path, head: Autoencoder) -> None:
+    """Write a fitted head as LangSplat reads it.
 
     LangSplat subtracts no mean: ours goes into the first and the last bias, which gives the same codes and embeddings up to
     float32 rounding.
 
     Raises:
-        ValueError: If the codec is not fitted.
+        ValueError: If the head is not fitted.
         OSError: If the file cannot be written.
     """
-    state = dict(codec.state_dict())
+    state = dict(head.state_dict())
     if "encoder.0.weight" not in state:
-        raise ValueError(f"autoencoder {path}: codec must be fitted, got one that is not")
+        raise ValueError(f"autoencoder {path}: head must be fitted, got one that is not")
     mean = state.pop("mean").double()
     state.pop("fitted_reconstruction")
     last = max(int(name.split(".")[1]) for name in state if name.startswith("decoder."))

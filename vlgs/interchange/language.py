@@ -4,24 +4,24 @@ from pathlib import Path
 
 import torch
 
-from vlgs.codec import Codec
 from vlgs.data.language import find_mask_files, read_mask_map, read_mask_vectors, write_mask_files
+from vlgs.heads.autoencoder import Autoencoder
 
 
-def compress_language(source: Path, target: Path, codec: Codec) -> int:
+def compress_language(source: Path, target: Path, head: Autoencoder) -> int:
     """Write the maps of a folder again, with codes for vectors.
 
     Args:
         source: With ``<stem>_s.npy`` and ``<stem>_f.npy``.
         target: Made if it is not there; files of the same names are replaced.
-        codec: Fitted to the width of the vectors.
+        head: Fitted to the width of the vectors.
 
     Returns:
         How many views were written.
 
     Raises:
         FileNotFoundError: If there are no maps.
-        ValueError: If a file is damaged, or its vectors have another width than the codec.
+        ValueError: If a file is damaged, or its vectors have another width than the head.
         OSError: If a file cannot be written.
     """
     stems = sorted(path.name.removesuffix("_s.npy") for path in source.glob("*_s.npy"))
@@ -36,7 +36,7 @@ def compress_language(source: Path, target: Path, codec: Codec) -> int:
         vectors = torch.from_numpy(read_mask_vectors(files))
         with torch.no_grad():
             try:
-                codes = codec.encode(vectors)
+                codes = head.encode(vectors)
             except RuntimeError as error:
                 what = "vectors must be as wide as the autoencoder's input"
                 raise ValueError(f"language {files.vectors}: {what}, got {error}") from None

@@ -40,7 +40,7 @@ def start_from(path: str | Path, attributes: Attributes) -> dict[str, Tensor]:
         params["features"] = normalize(params["features"], dim=1, eps=1e-9)
     if width != shape[0]:
         log.warning(
-            "%s: language codes of width %d start at zero (codec: %d)", path, width, shape[0]
+            "%s: language codes of width %d start at zero (head: %d)", path, width, shape[0]
         )
     log.info("%d Gaussians from %s", n, path)
     return conform(params, attributes)

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from vlgs.blend import ViewBlend
-from vlgs.codec import Codec
-from vlgs.codec.autoencoder import Autoencoder
 from vlgs.data.sampler import PairSampler, nearest_views
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
 from vlgs.gaussians.background import with_background
+from vlgs.heads import Head
+from vlgs.heads.autoencoder import Autoencoder
 from vlgs.indicator import Indicator, PerLevel
 from vlgs.interchange import load_weights, start_from
 from vlgs.module.lift import lift_features
@@ -38,7 +38,7 @@ class Parts:
     fusion: Fusion
     indicator: Indicator
     blend: ViewBlend
-    codec: Codec
+    head: Head
     loss: Mapping[str, Objective]
     """Name -> objective."""
     raster: RasterConfig
@@ -52,7 +52,7 @@ def build_module(
     color: bool = True,
     start: Mapping[str, Tensor] | None = None,
 ) -> VLGSModule:
-    """Fit the codec, place the Gaussians and put everything together.
+    """Fit the head, place the Gaussians and put everything together.
 
     Args:
         scene: What is learned.
@@ -66,18 +66,18 @@ def build_module(
     """
     if not scene.train:
         raise ValueError(f"train: training views of {scene.name} must be at least 1, got 0")
-    fusion, codec, config = parts.fusion, parts.codec, parts.gaussians
+    fusion, head, config = parts.fusion, parts.head, parts.gaussians
     if scene.mask_vectors.shape[0] > 0:
-        if isinstance(codec, Autoencoder) and codec.weights is not None:
-            load_weights(codec, codec.weights)
+        if isinstance(head, Autoencoder) and head.weights is not None:
+            load_weights(head, head.weights)
         else:
-            codec.fit(scene.mask_vectors, scene.mask_areas)
+            head.fit(scene.mask_vectors, scene.mask_areas)
     else:
         log.info("no language supervision: training colour only, without fusion or blended views")
         # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
-    width = codec.dim * scene.mask_levels
+    width = head.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.own_shape
     several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
@@ -94,7 +94,7 @@ def build_module(
         parameters,
         fusion,
         parts.indicator,
-        codec,
+        head,
         parts.raster,
         sh_degree=0,
         evaluated=config.color == "evaluated",
@@ -116,17 +116,19 @@ def bind(
     skip: SkipConfig,
     seed: int,
 ) -> Setup:
-    """Show a scene to objectives, with the codes that the model's codec gives its masks."""
+    """Show a scene to objectives, with the targets that the model's head makes of its masks."""
     cameras = [view.camera for view in scene.train]
     near = nearest_views(cameras, blend.neighbours) if blend.pairs == "neighbours" else None
     sampler = PairSampler(tuple((c.width, c.height) for c in cameras), seed, near)
     codes = torch.zeros(0, model.splats["features"].shape[1])
     if len(scene.mask_vectors) > 0:
         with torch.no_grad():
-            codes = model.codec.encode(scene.mask_vectors)
+            codes = model.head.targets(scene.mask_vectors)
     counts = SkipCount()
     views = TrainingViews(scene, codes, sampler, counts)
-    setup = Setup(views, objectives, blend, skip.blend_weight, skip.blend_reuse, counts)
+    setup = Setup(
+        views, model.predict, objectives, blend, skip.blend_weight, skip.blend_reuse, counts
+    )
     for objective in objectives.values():
         objective.bind(setup)
     return setup

@@ -113,7 +113,7 @@ def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions
 def _expected_warnings() -> Iterator[None]:
     """Silence two warnings of Lightning that are expected here."""
     with warnings.catch_warnings():
-        # The codec is fitted before training starts; its BatchNorm must keep the statistics it has.
+        # The head is fitted before training starts; its BatchNorm must keep the statistics it has.
         warnings.filterwarnings("ignore", message="Found .* module.* in eval mode")
         # Lightning 2.6 under torch 2.13, in its own tree utilities.
         warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated")

@@ -14,7 +14,7 @@ from vlgs.types import Scene, View
 def join_levels(scenes: Sequence[Scene]) -> Scene:
     """One scene whose views tell the masks of all levels apart, in the order of the scenes.
 
-    Vectors and areas are stacked, so that one codec serves all levels, as in LangSplat. All else is that of the last scene.
+    Vectors and areas are stacked, so that one head serves all levels, as in LangSplat. All else is that of the last scene.
 
     Args:
         scenes: One scene read at several mask levels, with the same training views.

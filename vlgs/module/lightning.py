@@ -134,6 +134,7 @@ class VLGSModule(L.LightningModule):
         ]
         given = self.settings.learning_rates
         rates = {"fusion": given.fusion, "exposure": given.exposure}
+        rates |= {"head": self.model.head.learning_rate or 0.0}
         rates |= {f"loss.{name}": part.rate for name, part in self.step.setup.objectives.items()}
         for name, part in self.step.modules().items():
             groups.append({"params": list(part.parameters()), "lr": rates[name], "name": name})

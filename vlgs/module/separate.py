@@ -71,7 +71,7 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
         both,
         NoFusion(),
         indicator,
-        language.codec,
+        language.head,
         color.raster,
         color.sh_degree,
         attributes=language.attributes,

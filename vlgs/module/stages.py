@@ -217,7 +217,7 @@ class Lift:
 
     demands: ClassVar[Sequence[Demand]] = tuple(
         Demand("language that is lifted", group, "untrained", "as nothing trains it")
-        for group in ("fusion", "indicator")
+        for group in ("fusion", "indicator", "head")
     )
     start: str
     """The earlier stage."""

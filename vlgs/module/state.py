@@ -60,11 +60,18 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
 
 def _beside(module: VLGSModule) -> dict[str, nn.Module]:
     """What is trained and is no part of the model."""
-    return {name: part for name, part in module.step.modules().items() if name != "fusion"}
+    inside = ("fusion", "head")
+    return {name: part for name, part in module.step.modules().items() if name not in inside}
 
 
 def _restore_model(module: VLGSModule, tensors: dict[str, Tensor]) -> None:
     expected = set(module.model.state_dict())
+    former = sorted(name for name in tensors if name.startswith("codec."))
+    if former:
+        raise ValueError(
+            f"resume: checkpoint must hold its head as head.*, got {former[0]}, from when it was called codec; without the "
+            "checkpoint folder the run starts anew"
+        )
     if expected != set(tensors):
         odd = sorted(expected.symmetric_difference(tensors))
         raise ValueError(

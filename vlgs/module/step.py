@@ -142,7 +142,9 @@ class TrainingStep:
 
     def modules(self) -> dict[str, nn.Module]:
         """What is trained beside the Gaussians, by the names of the optimiser's groups."""
-        named = {"fusion": self.model.fusion, "exposure": self.exposure}
+        trained = self.setup.views.has_language and self.model.head.learning_rate is not None
+        head = self.model.head if trained else None
+        named = {"fusion": self.model.fusion, "head": head, "exposure": self.exposure}
         named |= {f"loss.{name}": objective for name, objective in self.setup.objectives.items()}
         return {
             name: part

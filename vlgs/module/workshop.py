@@ -135,7 +135,7 @@ class Workshop:
             return build_module(scene, parts, self.seed, color)
         # Copies: training moves them in place, and other models may start from the same ones.
         splats = {name: value.detach().clone() for name, value in start.splats.items()}
-        width = parts.codec.dim * scene.mask_levels
+        width = parts.head.dim * scene.mask_levels
         if splats["features"].shape[1] != width:
             splats["features"] = torch.zeros(start.count, width)
         return build_module(scene, parts, self.seed, color, splats)

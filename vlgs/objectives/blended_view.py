@@ -40,6 +40,7 @@ class BlendedView(Objective):
         for objective in setup.objectives.values():
             if isinstance(objective, Language):
                 self.language = objective
+        self.language.bind(setup)
 
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """One term, where there is a blended view and its weight counts."""

@@ -1,12 +1,13 @@
 """Language: the second term of Eq. 8."""
 
+from collections.abc import Callable
 from typing import Literal
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vlgs.losses import masked_cosine, masked_l1, masked_mse
-from vlgs.objectives.objective import Objective, StepView
+from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.ops.squared_error import Pixels
 from vlgs.values import require_choice
 
@@ -33,6 +34,11 @@ class Language(Objective):
         require_choice("language", "pixels", pixels, ("valid", "all"))
         self.error = error
         self.pixels: Pixels = pixels
+        self.predict: Callable[[Tensor], Tensor] | None = None
+
+    def bind(self, setup: Setup) -> None:
+        """What is compared is said by the head of the model."""
+        self.predict = setup.predict
 
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """Sum over the views that have language."""
@@ -45,8 +51,9 @@ class Language(Objective):
     def of(
         self,
         feature: Float[Tensor, "h w c"],
-        codes: Float[Tensor, "h wl d"],
+        codes: Float[Tensor, "h wl t"],
         valid: Bool[Tensor, "h wl"] | None,
     ) -> Float[Tensor, ""]:
         """The error of one rendered map; with l mask levels a render has l d channels (`Target.codes`)."""
-        return _ERRORS[self.error](feature.view_as(codes), codes, valid, self.pixels)
+        shown = feature.view_as(codes) if self.predict is None else self.predict(feature)
+        return _ERRORS[self.error](shown, codes, valid, self.pixels)

@@ -18,6 +18,8 @@ class Setup:
     """What objectives are told before the first iteration."""
 
     views: TrainingViews
+    predict: Callable[[Float[Tensor, "h w c"]], Float[Tensor, "h wl t"]]
+    """What a rendered map of codes shows, to be compared with `Target.codes` (`vlgs.heads.Head.predict`)."""
     objectives: Mapping[str, "Objective"]
     """All of the run, by name."""
     blend: ViewBlend

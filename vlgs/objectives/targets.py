@@ -22,8 +22,8 @@ class Target:
 
     view: View
     image: Float[Tensor, "h w 3"]
-    codes: Float[Tensor, "h wl d"] | None
-    """Language codes; with ``levels=joint`` those of the l mask levels of a pixel stand beside each other in its row, so that losses
+    codes: Float[Tensor, "h wl t"] | None
+    """What pixels should show of language (`vlgs.heads.Head.targets`), mostly codes; with ``levels=joint`` those of the l mask levels of a pixel stand beside each other in its row, so that losses
     and blending need not know of levels."""
     valid: Bool[Tensor, "h wl"] | None
     """Where there is a mask; None like `codes` where the view has no language."""
@@ -34,13 +34,13 @@ class TrainingViews:
 
     Args:
         scene: With at least one training view.
-        codes: Language code of every mask, [m, d]; m = 0 without language.
+        codes: Target of every mask, [m, t]; m = 0 without language.
         sampler: Which views an iteration sees.
         counts: Where similarities that are known already are counted.
     """
 
     def __init__(
-        self, scene: Scene, codes: Float[Tensor, "m d"], sampler: PairSampler, counts: SkipCount
+        self, scene: Scene, codes: Float[Tensor, "m t"], sampler: PairSampler, counts: SkipCount
     ) -> None:
         self.scene = scene
         self.has_language = len(codes) > 0

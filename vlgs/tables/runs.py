@@ -12,6 +12,7 @@ from vlgs.config import CONF
 from vlgs.files import write_atomically
 from vlgs.finished import read_finished
 from vlgs.identity import PLACES, moves
+from vlgs.known import renamed
 from vlgs.runs import RunFolder
 from vlgs.tables.registry import read_yaml
 from vlgs.text import csv_line, markdown, screen, to_bytes, visible
@@ -157,7 +158,8 @@ def _options(folder: RunFolder, metrics: Mapping[str, Any]) -> dict[str, str]:
     kept = {key: value for key, value in content.items() if key != "data"}
     if isinstance(data, dict):
         kept["data"] = {k: v for k, v in data.items() if k not in (*PLACES, "_target_")}
-    return options | {k: _shown(k, value) for k, value in _leaves(kept, "") if moves(k)}
+    named = ((renamed(key) or key, value) for key, value in _leaves(kept, ""))
+    return options | {key: _shown(key, value) for key, value in named if moves(key)}
 
 
 def _leaves(node: Any, key: str, depth: int = 0) -> Iterable[tuple[str, Any]]:

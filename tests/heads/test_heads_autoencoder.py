@@ -8,9 +8,9 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from vlgs.codec import Codec
-from vlgs.codec.autoencoder import Autoencoder, AutoencoderTraining
 from vlgs.data.synthetic.language import vocabulary
+from vlgs.heads import Head
+from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
 
 CITYSCAPES = Path(__file__).parents[2] / (
     "../shared/data/clip_text_embeddings/semivl/cityscapes_single.npy"
@@ -44,8 +44,8 @@ def quick(**options) -> Autoencoder:
     return Autoencoder(encoder_widths=(16, 8), decoder_widths=(8, 16), training=QUICK, **options)
 
 
-def weights(codec: Autoencoder) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in codec.state_dict().items()}
+def weights(head: Autoencoder) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in head.state_dict().items()}
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
@@ -54,7 +54,7 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 @pytest.fixture(scope="module", params=["procedural", "real"])
 def camvid(request: pytest.FixtureRequest) -> tuple[Autoencoder, Tensor]:
-    """A codec, and the vectors of the eleven classes of a street that it was fitted to."""
+    """A head, and the vectors of the eleven classes of a street that it was fitted to."""
     if request.param == "procedural":
         words = (
             "sky",
@@ -74,42 +74,42 @@ def camvid(request: pytest.FixtureRequest) -> tuple[Autoencoder, Tensor]:
         classes = normalize(torch.from_numpy(np.load(CITYSCAPES)[CAMVID].astype(np.float32)))
     else:
         pytest.skip("real text embeddings not at hand")
-    codec = Autoencoder()
+    head = Autoencoder()
     vectors, areas, _ = masks(classes, 60, seed=2)
-    codec.fit(vectors, areas)
-    return codec, classes
+    head.fit(vectors, areas)
+    return head, classes
 
 
-def accuracy(codec: Autoencoder, classes: Tensor, codes: Tensor, labels: Tensor) -> float:
-    return (codec.decode(codes) @ classes.T).argmax(1).eq(labels).float().mean().item()
+def accuracy(head: Autoencoder, classes: Tensor, codes: Tensor, labels: Tensor) -> float:
+    return (head.decode(codes) @ classes.T).argmax(1).eq(labels).float().mean().item()
 
 
 def test_three_numbers_tell_real_classes_apart(camvid: tuple[Autoencoder, Tensor]):
-    codec, classes = camvid
+    head, classes = camvid
     vectors, _, labels = masks(classes, 20, seed=7)  # never seen
-    codes = codec.encode(vectors)
+    codes = head.encode(vectors)
     assert codes.shape == (220, 3)
-    assert accuracy(codec, classes, codes, labels) > 0.99
+    assert accuracy(head, classes, codes, labels) > 0.99
     # What is rendered is off by some noise, and shorter where little covers the pixel.
     nudged = codes + 0.1 * normalize(draw(220, 3, seed=3))
-    assert accuracy(codec, classes, nudged, labels) > 0.99
-    assert accuracy(codec, classes, 0.6 * codes, labels) > 0.99
+    assert accuracy(head, classes, nudged, labels) > 0.99
+    assert accuracy(head, classes, 0.6 * codes, labels) > 0.99
 
 
 def test_reconstruction_is_the_area_weighted_cosine(camvid: tuple[Autoencoder, Tensor]):
-    codec, classes = camvid
+    head, classes = camvid
     vectors, areas, _ = masks(classes, 60, seed=2)
-    cosines = (codec.decode(codec.encode(vectors)) * vectors).sum(1)
-    assert codec.reconstruction == pytest.approx((areas @ cosines / areas.sum()).item(), abs=1e-5)
+    cosines = (head.decode(head.encode(vectors)) * vectors).sum(1)
+    assert head.reconstruction == pytest.approx((areas @ cosines / areas.sum()).item(), abs=1e-5)
     # Noise of norm 0.35 on vectors of norm about 1.4 cannot be coded: the cosine ends near 1.4 / sqrt(1.4^2 + 0.35^2).
-    assert codec.reconstruction > 0.94
+    assert head.reconstruction > 0.94
 
 
 def test_layers_are_those_of_langsplat():
-    codec = Autoencoder()
-    codec.build(512)
+    head = Autoencoder()
+    head.build(512)
     shapes = {
-        name: tuple(value.shape) for name, value in codec.state_dict().items() if "weight" in name
+        name: tuple(value.shape) for name, value in head.state_dict().items() if "weight" in name
     }
     assert shapes == {
         "encoder.0.weight": (256, 512), "encoder.1.weight": (256,), "encoder.3.weight": (128, 256),
@@ -122,13 +122,13 @@ def test_layers_are_those_of_langsplat():
 
 
 def test_codes_and_embeddings_have_unit_length():
-    codec = quick(dim=4)
-    assert isinstance(codec, Codec)
+    head = quick(dim=4)
+    assert isinstance(head, Head)
     vectors, areas, _ = masks(cone(5), 10, seed=2)
-    codec.fit(vectors, areas)
-    codes = codec.encode(vectors)
+    head.fit(vectors, areas)
+    codes = head.encode(vectors)
     torch.testing.assert_close(codes.norm(dim=1), torch.ones(50))
-    decoded = codec.decode(0.4 * codes.reshape(5, 10, 4))
+    decoded = head.decode(0.4 * codes.reshape(5, 10, 4))
     assert decoded.shape == (5, 10, 64)
     torch.testing.assert_close(decoded.norm(dim=-1), torch.ones(5, 10))
 
@@ -156,10 +156,10 @@ def test_fit_is_a_function_of_the_data_and_leaves_the_global_generator_alone():
 
 
 def test_one_embedding_is_enough():
-    codec = Autoencoder(training=AutoencoderTraining(steps=200, batch=32))
+    head = Autoencoder(training=AutoencoderTraining(steps=200, batch=32))
     vector = normalize(draw(1, 64, seed=0))
-    codec.fit(vector, torch.ones(1))
-    assert (codec.decode(codec.encode(vector)) * vector).sum().item() > 0.99
+    head.fit(vector, torch.ones(1))
+    assert (head.decode(head.encode(vector)) * vector).sum().item() > 0.99
 
 
 def test_without_centring_nothing_is_subtracted():
@@ -171,23 +171,23 @@ def test_without_centring_nothing_is_subtracted():
     torch.testing.assert_close(centred.mean, areas @ vectors / areas.sum())
 
 
-def test_a_fitted_codec_does_not_change_in_training():
+def test_a_fitted_head_does_not_change_in_training():
     vectors, areas, _ = masks(cone(3), 5, seed=2)
-    codec = quick()
-    codec.fit(vectors, areas)
-    before, codes = weights(codec), codec.encode(vectors)
-    model = nn.ModuleDict({"codec": codec}).train()
-    torch.testing.assert_close(codec.encode(vectors[:1]), codes[:1])
-    assert same(before, weights(codec))
+    head = quick()
+    head.fit(vectors, areas)
+    before, codes = weights(head), head.encode(vectors)
+    model = nn.ModuleDict({"head": head}).train()
+    torch.testing.assert_close(head.encode(vectors[:1]), codes[:1])
+    assert same(before, weights(head))
     assert not any(parameter.requires_grad for parameter in model.parameters())
 
 
 def test_state_goes_to_a_checkpoint_and_back_whatever_the_embedding_width():
     vectors, areas, _ = masks(cone(4, width=24), 5, seed=2)
-    fitted, fresh = quick(), nn.ModuleDict({"codec": quick()})
+    fitted, fresh = quick(), nn.ModuleDict({"head": quick()})
     fitted.fit(vectors, areas)
-    fresh.load_state_dict(nn.ModuleDict({"codec": fitted}).state_dict())
-    loaded = fresh["codec"]
+    fresh.load_state_dict(nn.ModuleDict({"head": fitted}).state_dict())
+    loaded = fresh["head"]
     assert isinstance(loaded, Autoencoder)
     assert torch.equal(loaded.encode(vectors), fitted.encode(vectors))
     assert loaded.reconstruction == fitted.reconstruction
@@ -230,24 +230,24 @@ def test_a_damaged_cache_is_fitted_again(
 
 
 def test_bad_calls():
-    codec = quick()
-    for call in (codec.encode, codec.decode):
+    head = quick()
+    for call in (head.encode, head.decode):
         with pytest.raises(ValueError, match="fit or a state dict must come before"):
             call(torch.ones(2, 3))
     good = normalize(draw(3, 8, seed=0))
     with pytest.raises(ValueError, match="at least 1 row, got 0"):
-        codec.fit(good[:0], torch.ones(0))
+        head.fit(good[:0], torch.ones(0))
     bad = good.clone()
     bad[0, 0], bad[1] = torch.nan, 0.0
     with pytest.raises(ValueError, match="got 2 of 3 rows"):
-        codec.fit(bad, torch.ones(3))
+        head.fit(bad, torch.ones(3))
     for areas in (
         torch.zeros(3),
         torch.tensor([1.0, -1.0, 3.0]),
         torch.tensor([1.0, torch.inf, 0.0]),
     ):
         with pytest.raises(ValueError, match="areas must be finite"):
-            codec.fit(good, areas)
+            head.fit(good, areas)
 
 
 @pytest.mark.parametrize(
@@ -274,12 +274,12 @@ def test_of_many_embeddings_a_part_is_measured(monkeypatch: pytest.MonkeyPatch):
     vectors, areas, _ = masks(cone(6), 50, seed=7)
     seen: list[int] = []
     encode = Autoencoder.encode
-    monkeypatch.setattr("vlgs.codec.autoencoder.MEASURED", 64)
+    monkeypatch.setattr("vlgs.heads.autoencoder.MEASURED", 64)
     monkeypatch.setattr(
-        Autoencoder, "encode", lambda codec, rows: seen.append(len(rows)) or encode(codec, rows)
+        Autoencoder, "encode", lambda head, rows: seen.append(len(rows)) or encode(head, rows)
     )
-    codec = quick()
-    codec.fit(vectors, areas)
+    head = quick()
+    head.fit(vectors, areas)
     assert max(seen) == 60  # every fifth of 300
-    every = (codec.decode(encode(codec, vectors)) * vectors).sum(dim=1)
-    assert codec.reconstruction == pytest.approx((areas @ every / areas.sum()).item(), abs=0.03)
+    every = (head.decode(encode(head, vectors)) * vectors).sum(dim=1)
+    assert head.reconstruction == pytest.approx((areas @ every / areas.sum()).item(), abs=0.03)

@@ -1,4 +1,6 @@
-"""The codec that changes nothing: Gaussians carry the embeddings themselves."""
+"""The head that changes nothing: Gaussians carry the embeddings themselves."""
+
+from typing import ClassVar
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -17,9 +19,13 @@ class Identity(nn.Module):
         ValueError: If `dim` is not positive.
     """
 
+    untrained: ClassVar[bool] = True
+    """It is fitted before the Gaussians are trained."""
+    learning_rate: float | None = None
+
     def __init__(self, dim: int = 512) -> None:
         super().__init__()
-        require_range("identity codec", 1, 65536, dim=dim)
+        require_range("identity head", 1, 65536, dim=dim)
         self.dim = dim
 
     def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
@@ -30,12 +36,16 @@ class Identity(nn.Module):
         """
         if vectors.shape[1] != self.dim:
             raise ValueError(
-                f"identity codec: dim must be the embedding width {vectors.shape[1]}, got {self.dim}"
+                f"identity head: dim must be the embedding width {vectors.shape[1]}, got {self.dim}"
             )
 
-    def encode(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m e"]:
+    def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m e"]:
         """The embeddings as they are."""
         return vectors
+
+    def predict(self, codes: Float[Tensor, "*b e"]) -> Float[Tensor, "*b e"]:
+        """The codes as they are."""
+        return codes
 
     def decode(self, codes: Float[Tensor, "*b e"]) -> Float[Tensor, "*b e"]:
         """Unit length again, which blending does not keep."""

@@ -2,18 +2,18 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from vlgs.codec import Codec
-from vlgs.codec.identity import Identity
+from vlgs.heads import Head
+from vlgs.heads.identity import Identity
 
 
 def test_codes_are_the_embeddings():
-    codec = Identity(dim=8)
-    assert isinstance(codec, Codec)
+    head = Identity(dim=8)
+    assert isinstance(head, Head)
     vectors = normalize(torch.randn(5, 8), dim=1)
-    codec.fit(vectors, torch.ones(5))
-    assert torch.equal(codec.encode(vectors), vectors)
-    torch.testing.assert_close(codec.decode(0.3 * vectors.reshape(5, 1, 8)), vectors[:, None])
-    assert codec.decode(torch.zeros(2, 8)).eq(0).all()
+    head.fit(vectors, torch.ones(5))
+    assert torch.equal(head.targets(vectors), vectors)
+    torch.testing.assert_close(head.decode(0.3 * vectors.reshape(5, 1, 8)), vectors[:, None])
+    assert head.decode(torch.zeros(2, 8)).eq(0).all()
 
 
 def test_bad_input():

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -93,6 +94,9 @@ class Autoencoder(nn.Module):
         ValueError: If a width is not positive or there is no hidden layer.
     """
 
+    untrained: ClassVar[bool] = True
+    """It is fitted before the Gaussians are trained."""
+    learning_rate: float | None = None
     mean: Tensor
     fitted_reconstruction: Tensor
 
@@ -137,7 +141,7 @@ class Autoencoder(nn.Module):
         return super().train(False)
 
     def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
-        """Learn the codes of one scene, or read them from the cache; see `vlgs.codec.Codec`.
+        """Learn the codes of one scene, or read them from the cache; see `vlgs.heads.Head`.
 
         The result depends on the set of embeddings, not on their order, and the global generator is left alone.
 
@@ -162,6 +166,14 @@ class Autoencoder(nn.Module):
         """
         self._require_fitted()
         return normalize(self.encoder(vectors - self.mean), dim=-1)
+
+    def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m d"]:
+        """Codes, see `encode`."""
+        return self.encode(vectors)
+
+    def predict(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
+        """The codes as they are: one is compared with another."""
+        return codes
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """Unit embeddings of codes of any length; as in LangSplat the codes are not normalised first.

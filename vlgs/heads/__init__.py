@@ -1,0 +1,42 @@
+"""Heads: what stands between the short code that a Gaussian carries and an image-text embedding."""
+
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class Head(Protocol):
+    """The interface of a head. Implementations are modules, so that checkpoints contain what they learned.
+
+    A head is either fitted to the embeddings of a scene before training, and stays as it is, or it is trained along with the
+    Gaussians. What the language loss compares is `predict` of rendered codes with `targets` of masks: codes with codes, or
+    embeddings with embeddings. A head that is fitted before says so: ``untrained: ClassVar[bool] = True`` (`vlgs.demands`).
+    """
+
+    dim: int
+    """Width d of the codes."""
+    learning_rate: float | None
+    """Adam's, for parameters that are trained along with the Gaussians; None: they are fitted before."""
+
+    def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
+        """Prepare for one scene: learn all that is not trained along.
+
+        Args:
+            vectors: Unit embeddings of the masks, `Scene.mask_vectors`.
+            areas: Pixels that each one covers, `Scene.mask_areas`; its weight.
+        """
+        ...
+
+    def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m t"]:
+        """What pixels of masks with these unit embeddings should show."""
+        ...
+
+    def predict(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b t"]:
+        """What rendered codes show, to be compared with `targets`."""
+        ...
+
+    def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
+        """Unit embeddings of codes, which may be blends of several."""
+        ...
