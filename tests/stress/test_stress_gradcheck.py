@@ -74,7 +74,6 @@ NO_GRADIENT = {
         "photometric.Photometric.__call__", "language.Language.__call__",
         "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss",
     )},
-    "vlgs.objectives.targets.covered": "a mask",
     "vlgs.query.Query.relevancy": "protocol",
     "vlgs.query.Query.__call__": "protocol",
     "vlgs.query.text.TextEncoder.encode": "protocol",
