@@ -105,6 +105,7 @@ def densify(
     seed: int,
     step: int,
     centers: Float[Tensor, "v 3"] | None = None,
+    intruders: Bool[Tensor, " n"] | None = None,
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
@@ -121,6 +122,7 @@ def densify(
         seed: Of the run.
         step: Of the run; large Gaussians are spared until the first opacity reset has passed.
         centers: Of the training cameras; what is `BACKGROUND` away from all of them may be large. None: nothing may.
+        intruders: Gaussians to remove, whatever their weight (`vlgs.gaussians.clearance`).
 
     Raises:
         ValueError: If `state` has another size than `params`, or no Gaussian is finite.
@@ -129,7 +131,7 @@ def densify(
     if state.grad_sum.shape[0] != n:
         raise ValueError(f"densify: state must have {n} rows, got {state.grad_sum.shape[0]}")
     with torch.no_grad():
-        dead = _dead(params, config)
+        dead = _dead(params, config, intruders)
         grow = _hot(state, config) & ~dead
         grow = _highest(grow, state.mean(), config.max_count - int((~dead).sum()))
         small = _largest_scale(params) <= config.densify.dense_share * extent
@@ -162,8 +164,12 @@ def reset_opacity(
             moment.zero_()
 
 
-def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n"]:
-    """Gaussians that are too faint to matter, and those with broken parameters."""
+def _dead(
+    params: nn.ParameterDict,
+    config: GaussiansConfig,
+    intruders: Bool[Tensor, " n"] | None = None,
+) -> Bool[Tensor, " n"]:
+    """Gaussians that are too faint to matter or where nothing may be, and those with broken parameters."""
     indicator, opacity = params["indicator_logits"].sigmoid(), params["opacity_logits"].sigmoid()
     if indicator.dim() == 2:  # one level that needs a Gaussian keeps it
         indicator = indicator.amax(dim=1)
@@ -181,7 +187,10 @@ def _dead(params: nn.ParameterDict, config: GaussiansConfig) -> Bool[Tensor, " n
         raise ValueError("densify: Gaussians must be finite, got none that is")
     if not finite.all():
         log.warning("densify: %d of %d Gaussians are not finite", int((~finite).sum()), len(finite))
-    return _spare(weight < config.densify.prune_below, weight, finite) | ~finite
+    doomed = weight < config.densify.prune_below
+    if intruders is not None:
+        doomed |= intruders
+    return _spare(doomed, weight, finite) | ~finite
 
 
 def _spare(

@@ -54,6 +54,7 @@ class Densification(L.Callback):
                 module.seed,
                 done,
                 module.centers,
+                module.clearance.intruders(module.model.splats["means"]),
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)

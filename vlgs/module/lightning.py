@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from vlgs.blend import ViewBlend, blend_targets
 from vlgs.data.cache import PixelCache
 from vlgs.gaussians import DensifyState, GaussiansConfig
+from vlgs.gaussians.clearance import Clearance
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.losses import Losses, masked_mse, view_similarity
 from vlgs.module.blended import BlendPlan, CamerasBetween, plan_blend
@@ -104,6 +105,7 @@ class VLGSModule(L.LightningModule):
         self.between = CamerasBetween(self.sampler, [v.camera for v in scene.train], blend)
         viewmats = torch.stack([view.camera.viewmat for view in scene.train])
         self.extent, self.centers = scene_extent(viewmats), camera_center(viewmats).float()
+        self.clearance = Clearance(scene, gaussians_config.densify.clear_share)
         self.has_language = scene.mask_vectors.shape[0] > 0
         self.mask_codes = self._encode_masks()
         self.target_cache = PixelCache(self._room_for_targets())
