@@ -298,6 +298,15 @@ def test_a_run_is_told_its_scene_unless_the_folder_is_the_scene(
     assert {any(o.startswith("data.scene=") for o in run.overrides) for run in runs} == {told}
 
 
+def test_a_scene_file_is_one_scene_with_the_name_of_the_file(table: Table):
+    request = runner.read(["tab=ab-cam", "data.scene=mine/breakfast.yaml", "seeds=1"])
+    assert request.benchmark.scenes == ("breakfast",)
+    runs = plan([table], request.benchmark)
+    told = [[o for o in run.overrides if o.startswith("data.scene=")] for run in runs]
+    assert told == [["data.scene=mine/breakfast.yaml"]] * len(runs)
+    assert {run.scene for run in runs} == {"breakfast"}
+
+
 def test_runs_that_were_never_started_are_not_given_up(table: Table):
     run = plan([table], Benchmark("b", ("data=synthetic",), ("glassware",), (0,)))[0]
     tally = runner.Tally()

@@ -12,6 +12,7 @@ from tiny_runs import TINY, composed
 from torch import Tensor, nn
 
 from vlgs.config import instantiate
+from vlgs.fields.cloud import point_cloud
 from vlgs.fields.splat import ViewRender
 from vlgs.gaussians import GaussiansConfig, attributes_of, read_ply, write_ply
 from vlgs.gaussians.ply import parse_ply
@@ -133,7 +134,7 @@ def test_an_attribute_and_an_objective_of_ones_own_train_and_resume(
     assert_same_bits(whole, resumed)
     one, two = (capture(module, {}).tensors["loss.doubt.factor"] for module in (whole, resumed))
     assert torch.equal(one, two)
-    write_ply(tmp_path / "a.ply", splats, attributes=table)
+    write_ply(tmp_path / "a.ply", point_cloud(whole.model, []).params)
     assert torch.equal(parse_ply(tmp_path / "a.ply", table)["uncertainty"], splats["uncertainty"])
     assert "uncertainty" not in read_ply(tmp_path / "a.ply")  # other readers pass over it
 

@@ -36,7 +36,7 @@ from vlgs.ablate.plan import PlannedRun, find, plan
 from vlgs.ablate.progress import Count, duration, shown
 from vlgs.config import literal_override, override_value
 from vlgs.runs import STOPPED, stop_signals
-from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.benchmark import Benchmark, Composer, is_scene_file
 from vlgs.tables.frame import read_metrics
 from vlgs.tables.registry import Table, choose, load_tables
 from vlgs.tables.write import write_all
@@ -280,7 +280,8 @@ def _split(override: str) -> tuple[str, Any]:
 
 def _scenes(dataset: str, given: Mapping[str, str]) -> tuple[str, ...]:
     if "data.scene" in given:
-        return (given["data.scene"],)
+        scene = given["data.scene"]
+        return (Path(scene).stem if is_scene_file(scene) else scene,)
     if dataset in SCENES:
         return SCENES[dataset]
     if "data.root" not in given:

@@ -44,20 +44,18 @@ def write_ply(
     params: Parameters,
     dialect: Dialect = "vlgs",
     notes: Sequence[str] = (),
-    attributes: Attributes = STANDARD,
 ) -> None:
     """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
 
     Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator`` (one per mask level as ``indicator_0`` ...),
-    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ..., further attributes under
-    their names; readers that look properties up by name pass over them. The file is complete or the one before stays.
+    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ..., what `STANDARD` does not
+    have under its own name; readers that look properties up by name pass over them. The file is complete or the one before stays.
 
     Args:
         path: The file; its folder must exist.
         params: Raw parameters.
         dialect: ``3dgs`` leaves out what 3DGS does not have, ``feature3dgs`` all of that but the codes, which it calls ``semantic_0`` ...
         notes: ASCII lines for the header, `PLAIN` first; without it, nobody knows whether the parameters wait for a fusion.
-        attributes: The table of `params`.
 
     Raises:
         ValueError: If a value is not finite or a quaternion is zero; names the parameter and how many rows.
@@ -66,7 +64,7 @@ def write_ply(
     columns = {name: value.detach().to(torch.float32) for name, value in params.items()}
     require_sound(f"ply {path}", columns)
     named: dict[str, Tensor] = {}
-    for name, row in _in_dialect(attributes, dialect).items():
+    for name, row in _in_dialect(columns, dialect).items():
         if name not in columns:
             continue
         value = columns[name]
@@ -85,12 +83,14 @@ def write_ply(
     write_atomically(Path(path), stream.getvalue())
 
 
-def _in_dialect(attributes: Attributes, dialect: Dialect) -> Attributes:
+def _in_dialect(names: Collection[str], dialect: Dialect) -> Attributes:
+    """The rows that a dialect writes, in its order."""
     if dialect == "vlgs":
-        return attributes
-    kept = {name: attributes[name] for name in THREE_DGS}
+        further = {name: Attribute(name, None, name) for name in names if name not in STANDARD}
+        return {**STANDARD, **further}
+    kept = {name: STANDARD[name] for name in THREE_DGS}
     if dialect == "feature3dgs":
-        kept["features"] = replace(attributes["features"], columns="semantic")
+        kept["features"] = replace(STANDARD["features"], columns="semantic")
     return kept
 
 

@@ -177,9 +177,9 @@ class Composer:
             ) from error
 
     def takes_scenes(self) -> bool:
-        """Whether a run is told its scene (`data.scene`), or `data.root` is the scene."""
+        """Whether a run is told its scene (`data.scene`), or `data.root` or a scene file is the scene."""
         data = _compose(list(self.benchmark.overrides)).data
-        if "scene" not in data:
+        if "scene" not in data or is_scene_file(OmegaConf.select(data, "scene", default=None)):
             return False
         if OmegaConf.is_missing(data, "scene") or data.scene is not None:
             return True
@@ -192,6 +192,11 @@ class Composer:
             content = self._head | {"rows": self._rows}
             text = json.dumps(content, indent=1, sort_keys=True) + "\n"
             write_changed(self._file, text.encode())
+
+
+def is_scene_file(scene: str | None) -> bool:
+    """Whether `data.scene` is the path of a file (conf/data/README.md), whose stem is then the scene's name."""
+    return scene is not None and scene.endswith((".yaml", ".yml"))
 
 
 def _read_rows(path: Path | None, head: Mapping[str, Any]) -> dict[str, dict[str, str]]:
