@@ -101,6 +101,8 @@ WRONG = {
     part("sphere: {radius: 0.1}, glass: {color: [1, 2, 3]}"): "glass.color[1]: must be a number from 0 to 1, got 2",
     part("sphere: {radius: 0.1}, matte: {}"): "matte: must be matte with one of the keys color, plain",
     part("sphere: {radius: 0.1}, glass: {}, turn: {x: 1, y: 2}"): "turn: must be a turn about one axis",
+    "like: patchwork\n" + part("sphere: {radius: 0.1}, glass: {}").replace("{parts", "{class: mug, kind: translucent_reflective, parts"):
+        "things of one class are of one kind, got 'mug'",
     CUP + CUP: "line 2: must have every key once, got 'props'",
     "a: &a [1]\nb: *a": "line 2: must have no aliases, got *a",
     "[" * 500: "must have at most 20 levels",

@@ -100,13 +100,16 @@ def _read_scene(node: Node, name: str) -> SceneFile:
         props = {**props, **_props(entries["props"], colors)}
     objects, hard = (_spots(entries[k], props) if k in entries else () for k in ("objects", "hard"))
     stage = entries["stage"].option(("room", *STAGES)) if "stage" in entries else base.stage
-    read = replace(
-        base, stage=stage, objects=(*base.objects, *objects), hard=(*base.hard, *hard)
-    )  # fmt: skip
+    read = replace(base, stage=stage, objects=base.objects + objects, hard=base.hard + hard)
     if not read.objects:
         raise node.wrong("a scene with objects, or like another", list(entries))
-    if (parts := sum(len(spot.thing.parts) for spot in (*read.objects, *read.hard))) > MOST_PARTS:
+    things = [spot.thing for spot in read.objects + read.hard]
+    if (parts := sum(len(thing.parts) for thing in things)) > MOST_PARTS:
         raise node.wrong(f"a scene of at most {MOST_PARTS} parts", parts)
+    kinds = {thing.name: thing.kind for thing in things}
+    for thing in things:
+        if kinds[thing.name] != thing.kind:
+            raise node.wrong("a scene whose things of one class are of one kind", thing.name)
     return read
 
 
