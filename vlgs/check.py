@@ -16,8 +16,8 @@ from vlgs.arguments import take_command_line
 from vlgs.command import check_command
 from vlgs.config import CONF, check_config, instantiate
 from vlgs.data.colmap import load_scene, survey
-from vlgs.data.faults import Fault, SceneError, errors, listing, warning
-from vlgs.data.plausible import plausibility_warnings
+from vlgs.data.diagnostics import Fault, SceneError, errors, listing, warning
+from vlgs.data.scene_warnings import plausibility_warnings
 from vlgs.data.source import ColmapSource
 from vlgs.experiment import Experiment, construct
 from vlgs.prepare import doubts, prepare, rehearse

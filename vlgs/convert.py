@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vlgs.data.sparse import find_sparse, read_cameras, write_transforms
 from vlgs.data.sparse.write import write_colmap
-from vlgs.interchange import (
+from vlgs.formats import (
     FORMATS,
     compress_language,
     read_autoencoder,

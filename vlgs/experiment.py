@@ -17,12 +17,12 @@ from vlgs.demands import Demand, has, unmet
 from vlgs.identity import GIVEN_FILES, Identity, identity, run_id
 from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
-from vlgs.module.augment import Augment
-from vlgs.module.build import Parts
-from vlgs.module.levels import LEVEL_OPTIONS, Levels
-from vlgs.module.stages import Method, Stages
 from vlgs.places import record
 from vlgs.query import Query, TextEncoder
+from vlgs.training.augment import Augment
+from vlgs.training.build import Parts
+from vlgs.training.levels import LEVEL_OPTIONS, Levels
+from vlgs.training.stages import Method, Stages
 from vlgs.types import Scene
 
 Scenes = Mapping[int | None, Scene]

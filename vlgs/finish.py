@@ -6,8 +6,6 @@ from typing import Any
 
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.identity import RESULTS_VERSION
-from vlgs.module.stages import Progress
-from vlgs.module.workshop import Workshop, all_skips
 from vlgs.prepare import Prepared
 from vlgs.query import TextEncoder
 from vlgs.report.evaluate import evaluate
@@ -16,6 +14,8 @@ from vlgs.report.provenance import commit, machine
 from vlgs.report.results import write_metrics, write_queries
 from vlgs.report.timing import measure_fps
 from vlgs.report.words import questions_of
+from vlgs.training.stages import Progress
+from vlgs.training.workshop import Workshop, all_skips
 
 
 def report(

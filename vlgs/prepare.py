@@ -9,19 +9,19 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from vlgs.data.faults import Fault, warning
+from vlgs.data.diagnostics import Fault, warning
 from vlgs.experiment import Experiment, Scenes
+from vlgs.formats import file_digest
 from vlgs.heads.autoencoder import Autoencoder
-from vlgs.interchange import file_digest
-from vlgs.module.build import Parts
-from vlgs.module.fit import FitOptions
-from vlgs.module.stages import run_stages
-from vlgs.module.workshop import Workshop
 from vlgs.ops.rasterize import check_config as check_constants
 from vlgs.query import TextEncoder, encode_questions, words_of
 from vlgs.query.text import VocabularyText
 from vlgs.report.evaluate import evaluate
 from vlgs.runs import RunFolder
+from vlgs.training.build import Parts
+from vlgs.training.fit import FitOptions
+from vlgs.training.stages import run_stages
+from vlgs.training.workshop import Workshop
 from vlgs.types import Scene
 
 log = logging.getLogger(__name__)

@@ -124,11 +124,11 @@ def _run_in(folder: RunFolder, ready: "Prepared") -> int:
     finished = folder.finished()
     if finished is not None:
         return _say(finished, folder, "already done, nothing computed")
-    from vlgs.data.plausible import plausibility_warnings
+    from vlgs.data.scene_warnings import plausibility_warnings
     from vlgs.finish import report
-    from vlgs.module.stages import run_stages
-    from vlgs.module.workshop import StoppedError
     from vlgs.prepare import doubts, make_workshop, text_encoder
+    from vlgs.training.stages import run_stages
+    from vlgs.training.workshop import StoppedError
 
     experiment, scene = ready.experiment, ready.scene
     views = (*scene.train, *scene.test)

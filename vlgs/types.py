@@ -114,7 +114,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Shape:
+class Covariance:
     """Covariances of Gaussians: R S S^T R^T."""
 
     quats: Float[Tensor, "n 4"]
@@ -140,7 +140,7 @@ class Gaussians:
     """Coefficients of degrees 1 to 3; s is 0, 3, 8 or 15."""
     features: Float[Tensor, "n d"]
     """Language code f; those of all mask levels side by side with ``levels=joint``."""
-    language_shape: Shape | None = None
+    language_shape: Covariance | None = None
     """Covariance that language is blended with; None where it is colour's (``sharing=pos``, Table 17)."""
     further: Mapping[str, Float[Tensor, "n _"]] = field(default_factory=dict)
     """Further attributes by name, in natural units (``gaussians.attributes``)."""
@@ -156,7 +156,7 @@ class ChannelGroup:
     """Opacity, indicator, ...; in [0, 1]. Groups that share this very tensor share one transmittance chain."""
     shape_grad: bool = True
     """Whether this group's gradient reaches means, quats and scales (systems differ: Feature-3DGS as released says no)."""
-    shape: Shape | None = None
+    shape: Covariance | None = None
     """Covariances of this group's own, around the same means and in the same depth order; None: those of the scene."""
 
 

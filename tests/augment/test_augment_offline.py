@@ -14,9 +14,9 @@ from vlgs.features.extractor import MaskFeatures
 from vlgs.fields.splat import SplatModel
 from vlgs.geometry import camera_center
 from vlgs.identity import run_id
-from vlgs.module.augment import Offline
-from vlgs.module.build import Parts, build_module
-from vlgs.module.separate import without_language
+from vlgs.training.augment import Offline
+from vlgs.training.build import Parts, build_module
+from vlgs.training.separate import without_language
 from vlgs.types import Scene
 
 

@@ -15,12 +15,12 @@ from vlgs.bench.sheet import read_sheet
 from vlgs.bench.steps import measure_switches
 from vlgs.bench.train import QUICK
 from vlgs.bench.workload import make_workload
-from vlgs.blend import blend_camera
-from vlgs.blend.ratio import FixedBlend
-from vlgs.module.state import capture
-from vlgs.ops.frozen import FrozenView
+from vlgs.ops.cached_weights import FrozenView
 from vlgs.skips import SKIPS
+from vlgs.training.state import capture
 from vlgs.types import Camera
+from vlgs.view_blend import blend_camera
+from vlgs.view_blend.ratio import FixedBlend
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from vlgs.demands import Demand, unmet
 from vlgs.experiment import construct
 from vlgs.indicator import PerLevel
 from vlgs.known import options
-from vlgs.module.levels import LEVEL_OPTIONS
-from vlgs.module.sharing import Lifted, TwoModels
+from vlgs.training.levels import LEVEL_OPTIONS
+from vlgs.training.sharing import Lifted, TwoModels
 
 DEMANDS = [demand for option in (PerLevel, TwoModels, Lifted) for demand in option.demands]
 

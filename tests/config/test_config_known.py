@@ -43,7 +43,7 @@ def test_conf_mirrors_constructors(target: str):
     given = constructed()[target] - {"_target_", "_partial_"}
     taken = set(inspect.signature(get_object(target)).parameters) - SINCE_THE_SCENE
     assert given <= taken
-    if target not in ("vlgs.module.settings.TrainerConfig", "vlgs.blend.NoBlend"):
+    if target not in ("vlgs.training.settings.TrainerConfig", "vlgs.view_blend.NoBlend"):
         assert given == taken
 
 

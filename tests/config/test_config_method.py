@@ -10,10 +10,10 @@ from vlgs.config import check_config
 from vlgs.experiment import construct
 from vlgs.identity import identity
 from vlgs.known import option
-from vlgs.module.checkpoint import load_checkpoint
-from vlgs.module.stages import Lift, Train, TrainColor
 from vlgs.run import run
 from vlgs.runs import RunFolder
+from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.stages import Lift, Train, TrainColor
 
 FEATURES = """# @package _global_
 defaults:
@@ -22,14 +22,14 @@ defaults:
   - override /blend: none
 levels: joint
 stages:
-  - {_target_: vlgs.module.stages.TrainColor, name: geometry, kept: false}
-  - _target_: vlgs.module.stages.Train
+  - {_target_: vlgs.training.stages.TrainColor, name: geometry, kept: false}
+  - _target_: vlgs.training.stages.Train
     start: geometry
     freeze: [means, quats, log_scales, sh0, shN, opacity_logits]
 """
 LIFT = (
     FEATURES.partition("  - _target_")[0]
-    + "  - {_target_: vlgs.module.stages.Lift, start: geometry}\n"
+    + "  - {_target_: vlgs.training.stages.Lift, start: geometry}\n"
 )
 
 
@@ -67,10 +67,11 @@ def test_what_a_method_trains_moves_the_id_and_the_name_of_a_class_does_not(chos
     )
     assert len({plain, features, lift}) == 3
     kinds = [
-        f"stages=[{{_target_: vlgs.module.stages.{kind}, start: x}}]" for kind in ("Train", "Lift")
+        f"stages=[{{_target_: vlgs.training.stages.{kind}, start: x}}]"
+        for kind in ("Train", "Lift")
     ]
     assert len({identity(chosen(kind)).recipe for kind in kinds}) == 2
-    assert option("stages.0", "vlgs.module.stages.Train") == "train"
+    assert option("stages.0", "vlgs.training.stages.Train") == "train"
 
 
 def test_a_method_runs(chosen, tmp_path: Path):
@@ -94,9 +95,9 @@ def test_a_method_runs(chosen, tmp_path: Path):
         (["method=features", "sharing=none"], "sharing must be pos or pos_cov with stages of a method, as .*, got none"),
         (["method=lift", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
         (["stages=[3]"], "config: stages must be a list of stages, got"),
-        (["stages=[{_target_: vlgs.module.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
-        (["stages=[{_target_: vlgs.module.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),
-        (["stages=[{_target_: vlgs.module.stages.Train, name: renders}]"], r"none of augment, .*got 'renders'"),
+        (["stages=[{_target_: vlgs.training.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
+        (["stages=[{_target_: vlgs.training.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),
+        (["stages=[{_target_: vlgs.training.stages.Train, name: renders}]"], r"none of augment, .*got 'renders'"),
         (["stages=[]"], "stages: there must be at least one, got none"),
         (["stages=[{_target_: vlgs.run.run}]"], "stages.0._target_ must be one of"),
     ],
@@ -113,7 +114,7 @@ def test_what_no_method_can_be_is_refused(chosen, overrides: list[str], message:
 
 
 def test_two_stages_of_one_name_are_refused():
-    from vlgs.module.stages import Method
+    from vlgs.training.stages import Method
 
     with pytest.raises(ValueError, match="name must differ from those before it, got ''"):
         Method([TrainColor("geometry"), Train(), Lift("geometry")])

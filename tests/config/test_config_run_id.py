@@ -11,7 +11,7 @@ from vlgs.identity import identity, run_id
 def config(**changes: object) -> DictConfig:
     plain = {
         "data": {"_target_": "vlgs.data.colmap.load_scene", "root": "here"},
-        "blend": {"_target_": "vlgs.blend.BetaBlend", "alpha": 0.2},
+        "blend": {"_target_": "vlgs.view_blend.BetaBlend", "alpha": 0.2},
         "seed": 0,
         "results": "results",
         "threads": 2,
@@ -31,7 +31,7 @@ def test_the_id_ignores_where_things_lie_and_how_many_threads():
 
 
 @pytest.mark.parametrize(
-    "change", [{"seed": 1}, {"blend": {"_target_": "vlgs.blend.BetaBlend", "alpha": 0.1}}]
+    "change", [{"seed": 1}, {"blend": {"_target_": "vlgs.view_blend.BetaBlend", "alpha": 0.1}}]
 )
 def test_the_id_follows_the_configuration(change: dict):
     assert run_id(config(**change), "f") != run_id(config(), "f")
@@ -50,7 +50,7 @@ def test_runs_of_one_recipe_differ_in_seed_scene_and_place_only():
     assert identity(config(data=moved)) == here
     assert identity(config(data=moved | {"resize": 0.5})).data != here.data
     assert identity(config(data=moved | {"resize": 0.5})).recipe == here.recipe
-    assert identity(config(blend={"_target_": "vlgs.blend.NoBlend"})).recipe != here.recipe
+    assert identity(config(blend={"_target_": "vlgs.view_blend.NoBlend"})).recipe != here.recipe
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from test_data_colmap import add_dense, add_masks, unit_rows
 from tiny_runs import composed
 
 from vlgs.check import check_scene, training_memory
-from vlgs.data.faults import errors
+from vlgs.data.diagnostics import errors
 from vlgs.experiment import construct
 from vlgs.types import Scene
 

@@ -17,7 +17,7 @@ from test_data_colmap import add_dense, add_masks
 from vlgs.check import Report, check, check_scene, print_report
 from vlgs.config import CONF
 from vlgs.data.colmap import load_scene
-from vlgs.data.faults import errors
+from vlgs.data.diagnostics import errors
 
 
 def report(root: Path, **options: object) -> Report:

@@ -22,7 +22,7 @@ from PIL import Image
 
 from vlgs.config import CONF
 from vlgs.data.colmap import load_scene, survey
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.source import ColmapSource
 
 

@@ -18,7 +18,7 @@ from colmap_scenes import (
 from PIL import Image
 
 from vlgs.data.colmap import load_scene, survey
-from vlgs.data.faults import SceneError, errors
+from vlgs.data.diagnostics import SceneError, errors
 from vlgs.data.source import ColmapSource
 from vlgs.types import IGNORE_ID
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from vlgs.data.cache import PixelCache
 from vlgs.data.colmap import load_scene, survey
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.language import find_mask_files
 from vlgs.data.lens import Lens
 from vlgs.data.source import ColmapSource

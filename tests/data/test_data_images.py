@@ -10,7 +10,7 @@ from colmap_scenes import picture, write_scene
 from PIL import Image
 
 from vlgs.data.colmap import load_scene, survey
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.images import is_copy_of, open_photograph, read_photograph
 from vlgs.data.source import ColmapSource
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from vlgs.data.faults import SceneError, errors
+from vlgs.data.diagnostics import SceneError, errors
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
 from vlgs.data.labels.objects import crosses_itself, fill_polygons, read_labelled_image
 from vlgs.types import IGNORE_ID

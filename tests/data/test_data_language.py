@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.language import (
     MaskFiles,
     find_mask_files,

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.lens import (
     Lens,
     covers_all,

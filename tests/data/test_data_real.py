@@ -8,7 +8,7 @@ import torch
 
 from vlgs.check import check_scene
 from vlgs.data.colmap import load_scene, survey
-from vlgs.data.faults import errors
+from vlgs.data.diagnostics import errors
 from vlgs.data.labels import ObjectFolder, open_labels
 from vlgs.data.labels.objects import LabelledImage
 from vlgs.data.source import ColmapSource

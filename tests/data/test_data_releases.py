@@ -21,7 +21,7 @@ from tiny_runs import composed
 
 from vlgs.check import check
 from vlgs.config import instantiate
-from vlgs.data.faults import SceneError, errors
+from vlgs.data.diagnostics import SceneError, errors
 from vlgs.data.split import Split
 from vlgs.types import Scene
 

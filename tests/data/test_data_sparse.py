@@ -11,7 +11,7 @@ from colmap_scenes import PINHOLE, pycolmap, write_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vlgs.data.faults import SceneError, errors
+from vlgs.data.diagnostics import SceneError, errors
 from vlgs.data.sparse import binary, find_sparse, model_faults, read_sparse, text
 from vlgs.data.sparse.model import CAMERA_MODELS, PARAMETERS
 

@@ -16,7 +16,7 @@ from vlgs.check import check
 from vlgs.config import instantiate
 from vlgs.convert import convert
 from vlgs.data.colmap import load_scene
-from vlgs.data.faults import SceneError, errors
+from vlgs.data.diagnostics import SceneError, errors
 from vlgs.data.sparse import read_cameras
 from vlgs.types import Scene
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from vlgs.data.synthetic import NO_FAULTS, Faults
+from vlgs.data.synthetic import NO_NOISE, LabelNoise
 from vlgs.data.synthetic.language import NEGATIVES, mask_vector, text_vector, vocabulary
 from vlgs.data.synthetic.masks import Region, view_masks
 
@@ -19,7 +19,7 @@ NAMES = {
 }
 
 
-def views(faults: Faults, count: int = 60):
+def views(faults: LabelNoise, count: int = 60):
     return [view_masks(REGIONS, NAMES, WORDS, faults, (0, view)) for view in range(count)]
 
 
@@ -29,7 +29,7 @@ def owner(vector: np.ndarray) -> int:
 
 
 def test_without_faults_masks_are_the_regions_and_vectors_belong_to_their_words():
-    for masks, level in zip(views(NO_FAULTS, 1)[0], range(4), strict=True):
+    for masks, level in zip(views(NO_NOISE, 1)[0], range(4), strict=True):
         assert (masks.index >= 0).all()
         assert masks.index.max() == len(masks.vectors) - 1
         for row, vector in enumerate(masks.vectors):
@@ -40,7 +40,7 @@ def test_without_faults_masks_are_the_regions_and_vectors_belong_to_their_words(
 
 
 def test_missed_masks_leave_holes_at_their_rate():
-    holes = [(masks[2].index == -1).mean() for masks in views(Faults(0.2, 0.0, 0.0, 0.0, 0.0))]
+    holes = [(masks[2].index == -1).mean() for masks in views(LabelNoise(0.2, 0.0, 0.0, 0.0, 0.0))]
     assert np.mean(holes) == pytest.approx(
         0.2, abs=0.02
     )  # 2160 masks: three standard deviations are 0.026
@@ -48,7 +48,7 @@ def test_missed_masks_leave_holes_at_their_rate():
 
 def test_mislabelled_masks_carry_another_class_at_their_rate():
     wrong = []
-    for _, _, part, _ in views(Faults(0.0, 0.0, 0.15, 0.0, 0.0)):
+    for _, _, part, _ in views(LabelNoise(0.0, 0.0, 0.15, 0.0, 0.0)):
         rows = part.index[4::8, 4::8].ravel()
         wrong += [
             owner(part.vectors[r]) != n % 8
@@ -59,7 +59,7 @@ def test_mislabelled_masks_carry_another_class_at_their_rate():
 
 def test_merged_masks_join_a_neighbour_at_their_rate():
     merged = 0
-    for _, _, part, _ in views(Faults(0.0, 0.1, 0.0, 0.0, 0.0)):
+    for _, _, part, _ in views(LabelNoise(0.0, 0.1, 0.0, 0.0, 0.0)):
         assert (part.index >= 0).all()
         merged += len(NAMES[2]) - len(part.vectors)
         for row in range(len(part.vectors)):
@@ -72,8 +72,8 @@ def test_merged_masks_join_a_neighbour_at_their_rate():
 def test_merged_vector_is_the_mean_by_area():
     halves = {level: np.repeat(np.arange(40)[None] // 30, 20, 0) for level in (1, 2, 3)}
     names = {level: {0: Region("a", "a"), 1: Region("b", "b")} for level in halves}
-    merged = view_masks(halves, names, WORDS, Faults(0.0, 1.0, 0.0, 0.0, 0.0), (0, 0))[3]
-    large, small = view_masks(halves, names, WORDS, NO_FAULTS, (0, 0))[3].vectors
+    merged = view_masks(halves, names, WORDS, LabelNoise(0.0, 1.0, 0.0, 0.0, 0.0), (0, 0))[3]
+    large, small = view_masks(halves, names, WORDS, NO_NOISE, (0, 0))[3].vectors
     mean = 0.75 * large + 0.25 * small
     np.testing.assert_allclose(merged.vectors, [mean / np.linalg.norm(mean)], atol=1e-6)
     assert (merged.index == 0).all()
@@ -85,7 +85,7 @@ def test_borders_move_by_the_configured_root_mean_square(ragged):
     names = {level: {0: Region("a", "a"), 1: Region("b", "b")} for level in half}
     moves = []
     for view in range(30):
-        masks = view_masks(half, names, WORDS, Faults(0.0, 0.0, 0.0, 0.0, ragged), (0, view))
+        masks = view_masks(half, names, WORDS, LabelNoise(0.0, 0.0, 0.0, 0.0, ragged), (0, view))
         for masks_of_level in masks[1:]:
             moves.append((masks_of_level.index == 0).sum(1) - 100.0)
     assert np.sqrt(np.mean(np.square(moves))) == pytest.approx(ragged, rel=0.15)
@@ -98,18 +98,18 @@ def test_small_regions_get_no_mask():
     for numbers in regions.values():
         numbers[0, :4] = 1
     names = {level: {0: Region("a", "a"), 1: Region("b", "b")} for level in regions}
-    masks = view_masks(regions, names, WORDS, NO_FAULTS, (0, 0))[3]
+    masks = view_masks(regions, names, WORDS, NO_NOISE, (0, 0))[3]
     assert (masks.index[0, :4] == -1).all()
 
 
 def test_default_level_lays_pieces_over_wholes():
-    default = views(NO_FAULTS, 1)[0][0]
+    default = views(NO_NOISE, 1)[0][0]
     assert len(NAMES[3]) < len(default.vectors) <= len(NAMES[2]) * 2 + len(NAMES[3])
     np.testing.assert_array_equal(np.unique(default.index), np.arange(len(default.vectors)))
 
 
 def test_draws_depend_on_seed_view_and_level_only():
-    faults = Faults(0.1, 0.1, 0.1, 0.3, 1.5)
+    faults = LabelNoise(0.1, 0.1, 0.1, 0.3, 1.5)
     one, again = (view_masks(REGIONS, NAMES, WORDS, faults, (4, 7)) for _ in range(2))
     for a, b in zip(one, again, strict=True):
         np.testing.assert_array_equal(a.index, b.index)
@@ -125,13 +125,13 @@ def test_draws_depend_on_seed_view_and_level_only():
     [{"missed": -0.1}, {"missed": 0.6, "merged": 0.6}, {"noise": -1.0}, {"ragged": float("nan")}],
 )
 def test_impossible_faults_are_refused(rates):
-    with pytest.raises(ValueError, match="Faults: "):
-        Faults(**rates)
+    with pytest.raises(ValueError, match="LabelNoise: "):
+        LabelNoise(**rates)
 
 
 def test_a_rate_that_is_not_set_is_the_difficultys_own():
-    assert Faults(noise=0.7).resolve("easy") == Faults(0.05, 0.03, 0.05, 0.7, 1.0)
-    assert Faults().resolve("hard").missed == 0.10
+    assert LabelNoise(noise=0.7).resolve("easy") == LabelNoise(0.05, 0.03, 0.05, 0.7, 1.0)
+    assert LabelNoise().resolve("hard").missed == 0.10
 
 
 def test_words_lie_in_one_cone():

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vlgs.data.synthetic import NO_FAULTS, load_scene
+from vlgs.data.synthetic import NO_NOISE, load_scene
 from vlgs.data.synthetic.cameras import ABOVE, BEYOND, HALF_ARC, PAST, RING, stop_at
 from vlgs.geometry import camera_center
 from vlgs.types import IGNORE_ID, Scene, View
@@ -13,7 +13,7 @@ from vlgs.types import IGNORE_ID, Scene, View
 
 def load(scene: str, train: int = 8) -> Scene:
     return load_scene(
-        scene, width=48, height=36, train_views=train, test_views=4, points=600, faults=NO_FAULTS
+        scene, width=48, height=36, train_views=train, test_views=4, points=600, faults=NO_NOISE
     )
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from torch import Tensor
 
-from vlgs.data.synthetic import NO_FAULTS, Faults, Recipe, load_scene, studio
+from vlgs.data.synthetic import NO_NOISE, LabelNoise, Recipe, capture, load_scene
 from vlgs.data.synthetic.labels import components, object_labels
 from vlgs.data.synthetic.layouts import DIFFICULTIES
 from vlgs.data.synthetic.scene_file import find_scene
@@ -70,7 +70,7 @@ def test_every_scene_loads(name, difficulty):
 
 def test_the_same_arguments_give_the_same_bits():
     first = load_scene(**SMALL)
-    studio._open.cache_clear()
+    capture._open.cache_clear()
     again = load_scene(**SMALL)
     assert first.fingerprint == again.fingerprint
     assert torch.equal(first.points, again.points)
@@ -93,7 +93,7 @@ def test_the_same_arguments_give_the_same_bits():
         {"test_views": 1},
         {"seed": 1},
         {"points": 100},
-        {"faults": Faults(noise=0.1)},
+        {"faults": LabelNoise(noise=0.1)},
     ],
 )
 def test_whatever_changes_the_scene_changes_the_fingerprint(change):
@@ -103,7 +103,7 @@ def test_whatever_changes_the_scene_changes_the_fingerprint(change):
 
 
 def test_a_fault_written_out_is_the_same_as_the_preset():
-    written = Recipe(**SMALL, faults=Faults(missed=0.05))
+    written = Recipe(**SMALL, faults=LabelNoise(missed=0.05))
     assert written.fingerprint(3) == Recipe(**SMALL).fingerprint(3)
     assert load_scene(**SMALL).fingerprint == written.fingerprint(3)
 
@@ -123,12 +123,12 @@ def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, ca
     assert same(load_scene(**cached, points=7), load_scene(**SMALL, points=7))
     [file] = (tmp_path / "cache").iterdir()
 
-    studio._open.cache_clear()  # as another process would begin
-    monkeypatch.setattr(studio, "photograph", lambda *_: pytest.fail("traced again"))
+    capture._open.cache_clear()  # as another process would begin
+    monkeypatch.setattr(capture, "photograph", lambda *_: pytest.fail("traced again"))
     assert same(traced, load_scene(**cached))
 
     monkeypatch.undo()
-    studio._open.cache_clear()
+    capture._open.cache_clear()
     file.write_bytes(file.read_bytes()[:1000])
     assert same(traced, load_scene(**cached))
     assert "could not be read" in caplog.text
@@ -163,7 +163,7 @@ def test_masks_index_the_vectors_and_fill_the_areas(scene):
 
 
 def test_exact_supervision_agrees_with_the_dense_labels():
-    scene = load_scene(**SMALL, faults=NO_FAULTS)
+    scene = load_scene(**SMALL, faults=NO_NOISE)
     assert scene.vocabulary is not None
     text = scene.vocabulary.vectors[: len(scene.classes)]
     best = (scene.mask_vectors @ text.T).argmax(dim=1)
@@ -191,7 +191,7 @@ def test_points_project_onto_pixels_of_their_colour(scene):
 
 def test_points_lie_on_the_surfaces_that_their_view_sees():
     scene = load_scene("lookalikes", **SMALL)
-    taken = studio.open_studio(Recipe(find_scene("lookalikes"), **SMALL))
+    taken = capture.open_capture(Recipe(find_scene("lookalikes"), **SMALL))
     assert len(scene.points) == 4000  # nothing of glass or steel here, so every candidate is kept
     for shot, points in zip(taken.train, scene.points.split(1000), strict=True):
         center = camera_center(shot.camera.viewmat.double()).numpy()[:, None]
@@ -237,10 +237,10 @@ def test_configuration_mirrors_the_function():
     config = yaml.safe_load(path.read_text())
     assert config.pop("_target_") == "vlgs.data.synthetic.load_scene"
     faults = config.pop("faults")
-    assert faults.pop("_target_") == "vlgs.data.synthetic.Faults"
-    assert Faults(**faults) == Faults()
+    assert faults.pop("_target_") == "vlgs.data.synthetic.LabelNoise"
+    assert LabelNoise(**faults) == LabelNoise()
     defaults = {name: p.default for name, p in inspect.signature(load_scene).parameters.items()}
-    assert defaults.pop("faults") == Faults()
+    assert defaults.pop("faults") == LabelNoise()
     assert config.pop("cache") == "${results}/cache"
     assert defaults.pop("cache") is None
     assert config == defaults

@@ -10,7 +10,7 @@ import pytest
 from tiny_runs import TINY, composed
 
 from vlgs.check import check
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.synthetic import load_scene
 from vlgs.data.synthetic.scene_file import SCENES, find_scene
 from vlgs.data.untrusted.nodes import read_yaml

@@ -6,12 +6,12 @@ import torch
 
 from vlgs.data.synthetic import layouts, tracer
 from vlgs.data.synthetic.cameras import camera_at, moments
+from vlgs.data.synthetic.objects import Material, Part, Thing
 from vlgs.data.synthetic.patterns import Plain
 from vlgs.data.synthetic.photographs import photograph, pixel_rays
 from vlgs.data.synthetic.room import LAMP
 from vlgs.data.synthetic.scene_file import find_scene
 from vlgs.data.synthetic.shapes import Box, sphere
-from vlgs.data.synthetic.things import Material, Part, Thing
 from vlgs.data.synthetic.tracer import PANE, trace
 from vlgs.data.synthetic.world import NOTHING, Hits, World
 

@@ -13,7 +13,7 @@ from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import view_color
 from vlgs.geometry import camera_center
 from vlgs.heads.identity import Identity
-from vlgs.indicator import ColourOpacity, Fixed, Indicator, Learned
+from vlgs.indicator import Fixed, Indicator, Learned, Opacity
 from vlgs.types import Camera, RasterConfig
 
 N = 30
@@ -91,7 +91,7 @@ def test_without_fusion_every_bit_stays():
     ("indicator", "expected"),
     [
         (Learned(), "indicator_logits"),
-        (ColourOpacity(), "opacity_logits"),
+        (Opacity(), "opacity_logits"),
         (Fixed(0.25), torch.tensor(0.25).logit()),
         (Fixed(1.0), torch.tensor(HIGHEST_LOGIT)),
     ],

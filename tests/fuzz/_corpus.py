@@ -15,7 +15,7 @@ from PIL import Image
 
 from vlgs.check import check
 from vlgs.convert import convert
-from vlgs.data.faults import SceneError, errors
+from vlgs.data.diagnostics import SceneError, errors
 from vlgs.features.encoders import DenseMaps
 from vlgs.features.folder import FeatureFolder
 from vlgs.features.weights import Pretrained

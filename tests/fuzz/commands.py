@@ -13,12 +13,6 @@ from pathlib import Path
 from hydra.core.global_hydra import GlobalHydra
 
 # Imported here, that children need not: nothing of it computes.
-import vlgs.module.stages
-import vlgs.report.evaluate
-import vlgs.report.pictures
-import vlgs.report.results
-import vlgs.report.summary
-import vlgs.report.timing  # noqa: F401
 from vlgs import check, run
 
 COMMANDS = {"check": check.command, "run": run.command}

@@ -15,7 +15,7 @@ from PIL import Image
 import vlgs.convert
 import vlgs.data.colmap
 import vlgs.features.job
-import vlgs.interchange.start
+import vlgs.formats.start
 import vlgs.vocabulary  # noqa: F401 (imported once here, not in every child)
 from tests.fuzz.judge import Attack
 from vlgs.sfm.reconstruct import SfmOptions

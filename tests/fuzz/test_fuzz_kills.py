@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.fuzz.kills import Calls, Kill, chosen
-from vlgs.module.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from vlgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 
 
 def save_three(folder: Path, kill: Kill | None, told: Path) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
-from vlgs.ops.frozen import FrozenView
+from vlgs.ops.cached_weights import FrozenView
 from vlgs.ops.machine import multiply_adds
 from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, RasterConfig

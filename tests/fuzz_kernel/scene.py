@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vlgs.types import ChannelGroup, RasterConfig, Shape
+from vlgs.types import ChannelGroup, Covariance, RasterConfig
 
 POISON = (
     np.nan, np.inf, -np.inf, 0.0, -0.0, 5e-324, -5e-324, 1e-45, 1e-40, -1e-40, 1.1754944e-38, 1e-38,
@@ -61,7 +61,7 @@ class FuzzScene:
     def groups(self, leaves: dict[str, Tensor]) -> list[ChannelGroup]:
         """The groups of some leaves; groups with one shape have the very same."""
         shapes = {
-            k: Shape(leaves[f"shape{k}.quats"], leaves[f"shape{k}.scales"])
+            k: Covariance(leaves[f"shape{k}.quats"], leaves[f"shape{k}.scales"])
             for k in set(self.shape_of) - {None}
         }
         return [

@@ -5,7 +5,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from vlgs.indicator import ColourOpacity, Fixed, Learned
+from vlgs.indicator import Fixed, Learned, Opacity
 from vlgs.types import Gaussians
 
 CONF = Path(__file__).parents[2] / "conf" / "indicator"
@@ -31,11 +31,11 @@ def test_learned_is_the_parameter(gaussians: Gaussians):
 
 
 def test_opacity_is_the_very_tensor_that_colour_uses(gaussians: Gaussians):
-    assert ColourOpacity()(gaussians) is gaussians.opacities
+    assert Opacity()(gaussians) is gaussians.opacities
 
 
 def test_detached_opacity_gets_no_gradient(gaussians: Gaussians):
-    weight = ColourOpacity(detach=True)(gaussians)
+    weight = Opacity(detach=True)(gaussians)
     assert torch.equal(weight, gaussians.opacities)
     assert not weight.requires_grad
 
@@ -55,7 +55,7 @@ def test_fixed_outside_the_unit_interval_is_refused(value: float):
 
 @pytest.mark.parametrize(
     ("option", "want"),
-    [("learned", Learned()), ("opacity", ColourOpacity()), ("fixed", Fixed(1.0))],
+    [("learned", Learned()), ("opacity", Opacity()), ("fixed", Fixed(1.0))],
 )
 def test_option_is_the_default_of_its_class(option: str, want: object):
     assert instantiate(OmegaConf.load(CONF / f"{option}.yaml")) == want

@@ -11,7 +11,7 @@ from torch import Tensor
 import vlgs.ops
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
-from vlgs.ops.frozen import FrozenView
+from vlgs.ops.cached_weights import FrozenView
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.ssim import KERNELS
 from vlgs.ops.view_color import view_color

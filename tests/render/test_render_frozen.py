@@ -7,8 +7,8 @@ import torch
 from render_scenes import Splats, random_splats, relative_error, render
 from torch import Tensor
 
-from vlgs.fields.frozen import FrozenViews
-from vlgs.ops.frozen import FrozenBudgetError, FrozenView
+from vlgs.fields.cached_weights import FrozenViews
+from vlgs.ops.cached_weights import FrozenBudgetError, FrozenView
 from vlgs.types import Camera, RasterConfig
 
 

@@ -14,10 +14,10 @@ from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 
 from vlgs.convert import convert, main
+from vlgs.formats import write_autoencoder
 from vlgs.gaussians import STANDARD, read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN
 from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
-from vlgs.interchange import write_autoencoder
 from vlgs.run import run
 from vlgs.types import Scene
 

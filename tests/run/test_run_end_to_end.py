@@ -170,7 +170,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path):
     )
     assert match, errors
     assert "python -m vlgs.run" in errors
-    from vlgs.module.checkpoint import load_checkpoint
+    from vlgs.training.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(only_run(tmp_path).checkpoint)
     assert checkpoint is not None

@@ -15,12 +15,12 @@ import pytest
 from omegaconf import OmegaConf
 from tiny_runs import TINY, composed
 
-from vlgs.module.checkpoint import load_checkpoint
-from vlgs.module.curves import read_rows
-from vlgs.module.lightning import VLGSModule
 from vlgs.places import found_again, record
 from vlgs.run import run
 from vlgs.runs import STOPPED, RunFolder
+from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.curves import read_rows
+from vlgs.training.lightning import VLGSModule
 
 SHORT = (
     *(*TINY, "trainer=smoke", "trainer.iterations=9", "trainer.checkpoint_every=3"),

@@ -17,12 +17,12 @@ from vlgs.config import CONF, instantiate
 from vlgs.convert import convert
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
+from vlgs.formats import read_gaussians
 from vlgs.gaussians import read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN, read_notes
-from vlgs.interchange import read_gaussians
-from vlgs.module.build import Parts, build_module
-from vlgs.module.workshop import Made, Workshop
 from vlgs.runs import RunFolder
+from vlgs.training.build import Parts, build_module
+from vlgs.training.workshop import Made, Workshop
 from vlgs.types import Camera, Scene
 
 SHORT = (

@@ -7,12 +7,12 @@ import pytest
 import torch
 from tiny_runs import TINY, composed
 
-import vlgs.module.workshop
-from vlgs.module.checkpoint import load_checkpoint
-from vlgs.module.fit import fit
-from vlgs.module.lightning import VLGSModule
+import vlgs.training.workshop
 from vlgs.run import run
 from vlgs.runs import STOPPED, RunFolder
+from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.fit import fit
+from vlgs.training.lightning import VLGSModule
 
 SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30", "pictures=false", "threads=1")
 SEPARATE = ("sharing=none", "fusion=none")
@@ -93,7 +93,7 @@ def test_stopped_in_the_second_stage_it_goes_on_to_the_same_bits(
     whole = only_run(tmp_path / "whole")
 
     steps, lifts = 0, 0
-    step_of, lift = VLGSModule.training_step, vlgs.module.workshop.lift_features
+    step_of, lift = VLGSModule.training_step, vlgs.training.workshop.lift_features
 
     def stopping(self: VLGSModule, step: int, batch_idx: int) -> None:
         nonlocal steps
@@ -113,8 +113,8 @@ def test_stopped_in_the_second_stage_it_goes_on_to_the_same_bits(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(VLGSModule, "training_step", stopping)
-    monkeypatch.setattr("vlgs.module.workshop.fit", fit_until_stopped)
-    monkeypatch.setattr("vlgs.module.workshop.lift_features", lift_until_killed)
+    monkeypatch.setattr("vlgs.training.workshop.fit", fit_until_stopped)
+    monkeypatch.setattr("vlgs.training.workshop.lift_features", lift_until_killed)
     config = composed(*overrides, f"results={tmp_path / 'parts'}")
     try:
         assert run(config) == STOPPED

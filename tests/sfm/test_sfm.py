@@ -16,7 +16,7 @@ from PIL import Image
 from rich.console import Console
 
 from vlgs.data.colmap import survey
-from vlgs.data.faults import errors
+from vlgs.data.diagnostics import errors
 from vlgs.data.source import ColmapSource
 from vlgs.sfm import reconstruct as module
 from vlgs.sfm.__main__ import main

@@ -8,11 +8,11 @@ import torch
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
-from vlgs.module.build import Parts, build_module
-from vlgs.module.fit import FitOptions, fit
-from vlgs.module.lightning import VLGSModule
-from vlgs.module.separate import for_language, unite, without_language
 from vlgs.runs import RunFolder
+from vlgs.training.build import Parts, build_module
+from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.separate import for_language, unite, without_language
 from vlgs.types import Scene
 
 

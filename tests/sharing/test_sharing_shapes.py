@@ -18,12 +18,12 @@ from vlgs.gaussians import (
     read_ply,
     write_ply,
 )
-from vlgs.module.build import Parts, build_module
-from vlgs.module.fit import FitOptions, fit
-from vlgs.module.lightning import VLGSModule
-from vlgs.module.sharing import choose_sharing
 from vlgs.runs import RunFolder
-from vlgs.types import Camera, Scene, Shape
+from vlgs.training.build import Parts, build_module
+from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.sharing import choose_sharing
+from vlgs.types import Camera, Covariance, Scene
 
 CAMERA = Camera(
     torch.eye(4).double(), torch.tensor([[30.0, 0, 17], [0, 33, 15], [0, 0, 1]]).double(), 37, 29
@@ -53,7 +53,7 @@ def leaves(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
 def render(t: dict[str, torch.Tensor], backend: str = "cpu", config: RasterConfig | None = None):
     groups = [
         ChannelGroup(t["color"], t["opacity"]),
-        ChannelGroup(t["code"], t["indicator"], shape=Shape(t["own_quats"], t["own_scales"])),
+        ChannelGroup(t["code"], t["indicator"], shape=Covariance(t["own_quats"], t["own_scales"])),
     ]
     return rasterize(
         t["means"], t["quats"], t["scales"], groups, CAMERA.viewmat, CAMERA.K, CAMERA.width,
@@ -95,7 +95,7 @@ def test_gradients_against_finite_differences():
 
     def images(*values: torch.Tensor):
         t = dict(zip(names, values, strict=True))
-        own = Shape(t["own_quats"], t["own_scales"])
+        own = Covariance(t["own_quats"], t["own_scales"])
         groups = [
             ChannelGroup(t["color"], t["opacity"]),
             ChannelGroup(t["code"], t["indicator"], shape=own),

@@ -11,13 +11,13 @@ from torch.nn.functional import conv2d
 
 from tests.stress.case import Case, Verdict, bound
 from tests.stress.splats import make_splats, render
-from vlgs.blend.pose import slerp
 from vlgs.fields.similarity import cosines
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.mlp import MLP
 from vlgs.geometry import quat_to_rotmat
 from vlgs.losses import masked_cosine, ssim
 from vlgs.ops.ssim import C1, C2, SIGMA
+from vlgs.view_blend.pose import slerp
 
 
 def vanishing_vectors(full: bool) -> Verdict:

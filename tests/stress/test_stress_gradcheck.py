@@ -18,8 +18,6 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from tests.stress.splats import SMOOTH, make_splats
-from vlgs.blend import FixedBlend, blend_targets
-from vlgs.blend.pose import slerp
 from vlgs.fields.similarity import cosines, decoded_cosines
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
@@ -33,7 +31,7 @@ from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_
 from vlgs.heads.autoencoder import Autoencoder
 from vlgs.heads.identity import Identity
 from vlgs.heads.linear import Linear
-from vlgs.indicator import ColourOpacity, Learned, PerLevel
+from vlgs.indicator import Learned, Opacity, PerLevel
 from vlgs.losses import (
     l1_dssim,
     masked_cosine,
@@ -46,12 +44,14 @@ from vlgs.objectives import Language
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
-from vlgs.ops.frozen import FrozenView
+from vlgs.ops.cached_weights import FrozenView
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
 from vlgs.ops.view_color import view_color
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
+from vlgs.view_blend import FixedBlend, blend_targets
+from vlgs.view_blend.pose import slerp
 
 AREAS = ("ops", "fields", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "heads", "query", "indicator")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
@@ -83,8 +83,8 @@ NO_GRADIENT = {
     "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
     "vlgs.gaussians.ply.read_ply": "from a file",
     "vlgs.gaussians.ply.parse_ply": "from a file",
-    "vlgs.gaussians.sound.broken_rows": "a mask",
-    "vlgs.gaussians.sound.drop_broken": "picks rows of a file",
+    "vlgs.gaussians.validate.broken_rows": "a mask",
+    "vlgs.gaussians.validate.drop_broken": "picks rows of a file",
     **{f"vlgs.fields.{name}": "protocol" for name in (
         "Field.similarity", "HasGaussians.opacities", "HasGaussians.language_weights",
         "HasGaussians.gaussian_similarity", "HasGaussians.render_values",
@@ -96,7 +96,7 @@ NO_GRADIENT = {
     "vlgs.fields.several.SeveralFields.similarity": "training is over",
     "vlgs.fields.splat.ViewRender.detach": "takes the gradient away",
     "vlgs.ops.blend.weights_alone": "the constants of a FrozenView",
-    "vlgs.ops.frozen.Weights.render": "protocol",
+    "vlgs.ops.cached_weights.Weights.render": "protocol",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
 }  # fmt: skip
@@ -254,7 +254,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.ops.blend.blend": lambda: rasterizing("cpu", False),
     "vlgs.ops.project.project": lambda: rasterizing("cpu", True),
     "vlgs.ops.rasterize_reference.rasterize": lambda: rasterizing("reference", False),
-    "vlgs.ops.frozen.FrozenView.render": frozen,
+    "vlgs.ops.cached_weights.FrozenView.render": frozen,
     "vlgs.fields.splat.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
     "vlgs.fields.splat.SplatModel.gaussians": lambda: model(
         lambda m: tensors(m.gaussians())
@@ -298,8 +298,8 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.geometry.rotmat_to_quat": lambda: (rotmat_to_quat, [rotation]),
     "vlgs.geometry.camera_center": lambda: (camera_center, [draw(2, 4, 4)]),
     "vlgs.geometry.pose_matrix": lambda: (pose_matrix, [rotation, draw(4, 3)]),
-    "vlgs.blend.pose.slerp": lambda: (slerp, [draw(4, 4), draw(4, 4, seed=1), draw(4, low=0.1, high=0.9)]),
-    "vlgs.blend.target.blend_targets": lambda: (
+    "vlgs.view_blend.pose.slerp": lambda: (slerp, [draw(4, 4), draw(4, 4, seed=1), draw(4, low=0.1, high=0.9)]),
+    "vlgs.view_blend.target.blend_targets": lambda: (
         lambda a, b: blend_targets(a, VALID, b, VALID.flip(1), 0.3, FixedBlend(value=0.3, mask="or"))[0],
         [draw(*SIZE), draw(*SIZE, seed=1)],
     ),
@@ -350,8 +350,8 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.indicator.PerLevel.__call__": lambda: (
         lambda *v: PerLevel()(activated(*v)), list(parameters().values())
     ),
-    "vlgs.indicator.ColourOpacity.__call__": lambda: (
-        lambda *v: ColourOpacity()(activated(*v)), list(parameters().values())
+    "vlgs.indicator.Opacity.__call__": lambda: (
+        lambda *v: Opacity()(activated(*v)), list(parameters().values())
     ),
 }  # fmt: skip
 

@@ -18,13 +18,13 @@ from vlgs.config import CONF, instantiate
 from vlgs.data.synthetic import load_scene
 from vlgs.gaussians.logistic import logit
 from vlgs.gaussians.parameters import activate
-from vlgs.module import stuck
-from vlgs.module.build import Parts, build_module
-from vlgs.module.checkpoint import load_checkpoint
-from vlgs.module.fit import FitOptions, fit
-from vlgs.module.lightning import VLGSModule
 from vlgs.ops.rasterize import rasterize
 from vlgs.runs import RunFolder
+from vlgs.training import zero_gradients
+from vlgs.training.build import Parts, build_module
+from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lightning import VLGSModule
 from vlgs.types import ChannelGroup, Scene
 
 TINY = ("head.training.steps=30", "head.cache_dir=null", "trainer=smoke")
@@ -219,12 +219,12 @@ def _alarms(module: VLGSModule) -> set[str]:
             found.append(str(record.args[0]) if isinstance(record.args, tuple) else "")
 
     handler = Catch()
-    stuck.log.addHandler(handler)
+    zero_gradients.log.addHandler(handler)
     try:
         with tempfile.TemporaryDirectory() as folder:
             train(module, Path(folder))
     finally:
-        stuck.log.removeHandler(handler)
+        zero_gradients.log.removeHandler(handler)
     return set(found)
 
 

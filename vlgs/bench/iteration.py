@@ -15,9 +15,9 @@ from rich.table import Table
 from vlgs.bench.clock import replaced
 from vlgs.bench.presets import build, composed
 from vlgs.experiment import construct
-from vlgs.module.lightning import VLGSModule
 from vlgs.objectives import BlendedView
 from vlgs.ops import attention, blend, project, view_color
+from vlgs.training.lightning import VLGSModule
 
 KERNELS = ("project", "blend", "fusion", "Adam")
 """Parts that are not overhead: everything else is called the rest."""

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 from vlgs.bench.clock import Pass
 from vlgs.bench.outcome import Outcome
 from vlgs.fusion.none import NoFusion
-from vlgs.module.build import bind
-from vlgs.module.lightning import VLGSModule
-from vlgs.module.settings import SkipConfig
-from vlgs.module.state import capture, restore
-from vlgs.module.step import Forward
 from vlgs.skips import SKIPS, Skip
+from vlgs.training.build import bind
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.settings import SkipConfig
+from vlgs.training.state import capture, restore
+from vlgs.training.step import Forward
 
 FROZEN = ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits", "indicator_logits")
 """What is frozen on both sides of ``frozen_weights``: all but language."""

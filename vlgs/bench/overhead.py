@@ -8,8 +8,8 @@ from statistics import median
 
 from vlgs.bench.presets import build, composed
 from vlgs.experiment import construct
-from vlgs.module.fit import FitOptions, fit
 from vlgs.runs import RunFolder
+from vlgs.training.fit import FitOptions, fit
 
 OVERRIDES = (
     "data.train_views=8",

@@ -10,13 +10,13 @@ from omegaconf import DictConfig
 from vlgs.config import CONF, check_config, check_targets, instantiate
 from vlgs.experiment import Experiment, construct
 from vlgs.known import options
-from vlgs.module.build import build_module
-from vlgs.module.checkpoint import load_checkpoint
-from vlgs.module.fit import FitOptions, fit
-from vlgs.module.lightning import VLGSModule
-from vlgs.module.state import restore
 from vlgs.places import found_again, write_config
 from vlgs.runs import RunFolder
+from vlgs.training.build import build_module
+from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.state import restore
 from vlgs.types import RasterConfig, Scene
 
 

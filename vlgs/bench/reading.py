@@ -13,7 +13,7 @@ import numpy as np
 from vlgs.bench.child import Child, peak_mib
 
 if TYPE_CHECKING:
-    from vlgs.module.lightning import VLGSModule
+    from vlgs.training.lightning import VLGSModule
 
 DISTINCT = 10
 """Photographs and maps of masks that differ; the others are further names of them, and are read and hashed like any other.

@@ -16,9 +16,9 @@ from vlgs.bench.memory import MIB
 from vlgs.bench.one_step import Step, StepSwitch, measure_step, run_steps, step_switches, turned
 from vlgs.bench.outcome import Errors, compare
 from vlgs.geometry import camera_center
-from vlgs.module.lightning import VLGSModule
 from vlgs.objectives import BlendedView
 from vlgs.objectives.between import BlendPlan
+from vlgs.training.lightning import VLGSModule
 from vlgs.types import Camera
 
 STEPS = 4

@@ -23,9 +23,9 @@ from vlgs.bench.sheet import (
     write_sheet,
 )
 from vlgs.experiment import construct
-from vlgs.module.fit import FitOptions, fit
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS, turn
+from vlgs.training.fit import FitOptions, fit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,9 +17,9 @@ from vlgs.bench.sheet import provenance, read_sheet, say, show, write_sheet
 from vlgs.bench.unseen_draw import draw_unseen
 from vlgs.experiment import construct
 from vlgs.identity import RESULTS_VERSION
-from vlgs.module.fit import FitOptions, fit
 from vlgs.report.provenance import commit
 from vlgs.runs import RunFolder
+from vlgs.training.fit import FitOptions, fit
 
 PROCEDURAL = ("glassware_ring", "mirrors_sky", "lookalikes_wall")
 """In a room, under a sky, before a plain wall."""

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from vlgs.data.cache import PixelCache
-from vlgs.data.faults import Fault, FaultList, SceneError, errors, require_sound, warning
+from vlgs.data.diagnostics import Fault, FaultList, SceneError, errors, require_sound, warning
 from vlgs.data.images import transparency_warnings
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
 from vlgs.data.language import read_vocabulary
@@ -31,7 +31,7 @@ from vlgs.data.masks import (
     stray_faults,
     width_warnings,
 )
-from vlgs.data.registered import (
+from vlgs.data.posed_images import (
     ImageFolder,
     attach_labels,
     coverage_warnings,

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from vlgs.data.faults import Fault, SceneError, listing, warning
+from vlgs.data.diagnostics import Fault, SceneError, listing, warning
 from vlgs.data.untrusted.pictures import picture
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})

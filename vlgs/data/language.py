@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int32, Shaped
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.untrusted.arrays import Archive, map_npy
 from vlgs.data.untrusted.text import read_json
 from vlgs.files import write_atomically

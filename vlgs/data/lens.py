@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.sparse.model import SparseCamera
 
 _BLOCK = 1 << 20

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from vlgs.data.faults import Fault, SceneError, listing, warning
+from vlgs.data.diagnostics import Fault, SceneError, listing, warning
 from vlgs.data.language import find_mask_files, mask_map_size, read_mask_vectors
 from vlgs.data.views import ViewSource, map_sizes
 

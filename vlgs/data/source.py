@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vlgs.data.faults import listing
+from vlgs.data.diagnostics import listing
 from vlgs.data.sparse import find_sparse
 from vlgs.data.split import Split
 from vlgs.values import require_fields

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
-from vlgs.data.faults import Fault, listing
+from vlgs.data.diagnostics import Fault, listing
 
 KINDS = ("llff", "holdout", "all", "list")
 

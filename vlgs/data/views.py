@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int, Int32, Int64, Shaped, UInt8
 from torch import Tensor
 
 from vlgs.data.cache import PixelCache
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.images import Photograph, read_photograph
 from vlgs.data.labels import DenseFolder, ObjectFolder
 from vlgs.data.labels.objects import ObjectImage

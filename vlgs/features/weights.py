@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from vlgs.data.faults import SceneError
+from vlgs.data.diagnostics import SceneError
 from vlgs.data.untrusted.text import read_json
 
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"

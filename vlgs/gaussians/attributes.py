@@ -35,7 +35,7 @@ class Attribute:
     start: float | str = 0.0
     """Raw value where nothing else gives one, or the name of the attribute that it starts as a copy of."""
     rate: float = 0.0
-    """Adam's. That of the positions is in scene extents and decays (`vlgs.module.settings.TrainerConfig.means_rate`)."""
+    """Adam's. That of the positions is in scene extents and decays (`vlgs.training.settings.TrainerConfig.means_rate`)."""
     blended_by: str | None = None
     """The weight that blends it into an image; None: it is not drawn. In place of the indicator stands what ``indicator=`` says."""
     shape_grad: bool = True

@@ -103,14 +103,14 @@ class GaussiansConfig:
     init_indicator: float = 0.1
     """The paper starts the indicator in the same manner as the opacity (its section 4.1)."""
     init_features: Literal["zero", "lifted"] = "zero"
-    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (`vlgs.module.lift`; conf/README.md, D.9)."""
+    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`; conf/README.md, D.9)."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
     """Directions all around in which a Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
     silent_above: float = 0.7
     """Share of a Gaussian's language weight outside of masks, over the training views, above which its code is zero in the end
-    (`vlgs.module.silence`); 1: none is."""
+    (`vlgs.training.silence`); 1: none is."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -120,7 +120,7 @@ class GaussiansConfig:
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
     reading of the paper (conf/README.md, D.10); ``indicator`` is for Gaussians of language alone."""
     init: str | None = None
-    """File of Gaussians to start from (`vlgs.interchange.read_gaussians`); None starts from the sparse points."""
+    """File of Gaussians to start from (`vlgs.formats.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (conf/README.md, D.11)."""
     attributes: Mapping[str, Any] = field(default_factory=dict)

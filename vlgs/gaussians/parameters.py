@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vlgs.gaussians.attributes import STANDARD, THREE_DGS, Attribute, Attributes
-from vlgs.types import Gaussians, Shape
+from vlgs.types import Covariance, Gaussians
 
 Parameters = nn.ParameterDict | Mapping[str, Tensor]
 """Name of an attribute -> [n, ...]; row i of every one of them is Gaussian i."""
@@ -31,7 +31,7 @@ def activate(params: Parameters, attributes: Attributes = STANDARD) -> Gaussians
     natural = {name: attributes[name].activate(value) for name, value in params.items()}
     shape = None
     if "language_quats" in natural:
-        shape = Shape(natural["language_quats"], natural["language_log_scales"])
+        shape = Covariance(natural["language_quats"], natural["language_log_scales"])
     return Gaussians(
         means=natural["means"],
         quats=natural["quats"],

@@ -25,7 +25,7 @@ from vlgs.gaussians.attributes import (
     Attributes,
 )
 from vlgs.gaussians.parameters import Parameters, complete
-from vlgs.gaussians.sound import require_sound
+from vlgs.gaussians.validate import require_sound
 
 Dialect = Literal["vlgs", "3dgs", "feature3dgs"]
 

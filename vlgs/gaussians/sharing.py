@@ -1,4 +1,4 @@
-"""What the Gaussians have to know of what colour and language have in common; the options are in `vlgs.module.sharing`."""
+"""What the Gaussians have to know of what colour and language have in common; the options are in `vlgs.training.sharing`."""
 
 from typing import Protocol, runtime_checkable
 

@@ -87,7 +87,7 @@ class Autoencoder(nn.Module):
             LangSplat's.
         training: Schedule and weights of the fit.
         cache_dir: Folder of fitted weights by content of data and settings; None keeps nothing.
-        weights: File of weights that take the place of a fit (`vlgs.interchange.load_weights` reads it), such as those that
+        weights: File of weights that take the place of a fit (`vlgs.formats.load_weights` reads it), such as those that
             LangSplat's codes were made with.
 
     Raises:

@@ -47,7 +47,7 @@ class PerLevel:
 
 
 @dataclass(frozen=True)
-class ColourOpacity:
+class Opacity:
     """Language blended with the colour opacity, as earlier systems do (Eq. 2)."""
 
     untrained: ClassVar[bool] = True

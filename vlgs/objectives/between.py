@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from vlgs.blend import ViewBlend, blend_cameras
 from vlgs.data.sampler import PairSampler
 from vlgs.types import Camera
+from vlgs.view_blend import ViewBlend, blend_cameras
 
 AHEAD = 32
 """Iterations whose blended cameras are made together."""

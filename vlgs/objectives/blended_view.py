@@ -3,12 +3,12 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.blend import blend_targets
 from vlgs.objectives.between import BlendPlan, CamerasBetween, plan_blend
 from vlgs.objectives.language import Language
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import Target
 from vlgs.values import require_range
+from vlgs.view_blend import blend_targets
 
 MOST = 1e6
 """Upper limit of the weight, far above any useful one."""

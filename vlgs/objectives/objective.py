@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.blend import ViewBlend
 from vlgs.fields.splat import ViewRender
 from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.skip_count import SkipCount
+from vlgs.view_blend import ViewBlend
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Setup:
     """All of the run, by name."""
     blend: ViewBlend
     blend_least: float
-    """`vlgs.module.settings.SkipConfig.blend_weight`."""
+    """`vlgs.training.settings.SkipConfig.blend_weight`."""
     blend_reuse: float
     counts: SkipCount
     """Where work that is left out is counted."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vlgs.ops.blend import blend
 from vlgs.ops.project import Splats, project
-from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered, Shape
+from vlgs.types import Camera, ChannelGroup, Covariance, RasterConfig, Rendered
 
 DEFAULT = RasterConfig()
 
@@ -107,7 +107,7 @@ def _rasterize(
 def _reshaped(
     splats: Splats,
     means: Float[Tensor, "n 3"],
-    shape: Shape | None,
+    shape: Covariance | None,
     camera: Camera,
     config: RasterConfig,
 ) -> Splats:

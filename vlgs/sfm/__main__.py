@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from vlgs.arguments import command_line
-from vlgs.data.faults import listing
+from vlgs.data.diagnostics import listing
 from vlgs.sfm.compare import compare_poses
 from vlgs.sfm.reconstruct import ADVICE, SfmOptions, reconstruct
 from vlgs.sfm.result import Reconstruction

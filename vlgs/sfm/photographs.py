@@ -4,7 +4,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from vlgs.data.faults import SceneError, listing
+from vlgs.data.diagnostics import SceneError, listing
 from vlgs.data.images import SUFFIXES
 from vlgs.data.untrusted.pictures import picture
 

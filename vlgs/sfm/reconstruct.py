@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from vlgs.data.faults import listing
+from vlgs.data.diagnostics import listing
 from vlgs.files import write_atomically
 from vlgs.sfm.photographs import find_photographs
 from vlgs.sfm.result import REPORT, Reconstruction, count_apart, read_finished

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlgs.data.faults import listing
+from vlgs.data.diagnostics import listing
 
 REPORT = "sfm.json"
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from vlgs.data.faults import Fault
+from vlgs.data.diagnostics import Fault
 from vlgs.data.labels.dense import DenseFolder, open_dense
 from vlgs.data.labels.folders import open_class_folders, open_prompt_folders
 from vlgs.data.labels.objects import ObjectFolder, open_objects

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from vlgs.data.faults import Fault, SceneError, listing
+from vlgs.data.diagnostics import Fault, SceneError, listing
 from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.text import read_json
 from vlgs.types import IGNORE_ID

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from vlgs.data.faults import Fault, SceneError, listing, warning
+from vlgs.data.diagnostics import Fault, SceneError, listing, warning
 from vlgs.data.labels.objects import ObjectFolder
 from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.text import read_text

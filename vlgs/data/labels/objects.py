@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from PIL import Image, ImageDraw
 
-from vlgs.data.faults import Fault, SceneError, warning
+from vlgs.data.diagnostics import Fault, SceneError, warning
 from vlgs.data.untrusted.text import read_json
 
 _MOST_CORNERS = 1_000_000

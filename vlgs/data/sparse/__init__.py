@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from vlgs.data.faults import require_sound
+from vlgs.data.diagnostics import require_sound
 from vlgs.data.sparse import binary, llff, text, transforms
 from vlgs.data.sparse.model import (
     SparseCamera,

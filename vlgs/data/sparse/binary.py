@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from vlgs.data.faults import Fault, SceneError, listing
+from vlgs.data.diagnostics import Fault, SceneError, listing
 from vlgs.data.sparse.model import CAMERA_MODELS, SparseCamera, SparseImage
 from vlgs.data.untrusted import read_bytes
 

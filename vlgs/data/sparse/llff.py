@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.images import SUFFIXES
 from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
 from vlgs.data.untrusted.arrays import map_npy

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from vlgs.data.faults import Fault, listing, warning
+from vlgs.data.diagnostics import Fault, listing, warning
 
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from vlgs.data.faults import Fault, SceneError, listing
+from vlgs.data.diagnostics import Fault, SceneError, listing
 from vlgs.data.sparse.model import PARAMETERS, SparseCamera, SparseImage
 from vlgs.data.untrusted.text import read_text
 

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float64, UInt8
 from plyfile import PlyData, PlyElement
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
 from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.ply import read_vertices

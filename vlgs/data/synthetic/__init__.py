@@ -35,8 +35,8 @@ offset and noise. Fault rates are round numbers, not measurements of SAM or CLIP
 mechanism; numbers compare with each other and with nothing that was measured on photographs.
 """
 
-from vlgs.data.synthetic.masks import NO_FAULTS, Faults, LevelMasks
+from vlgs.data.synthetic.masks import NO_NOISE, LabelNoise, LevelMasks
 from vlgs.data.synthetic.recipe import Recipe
 from vlgs.data.synthetic.scene import language_levels, load_scene
 
-__all__ = ["NO_FAULTS", "Faults", "LevelMasks", "Recipe", "language_levels", "load_scene"]
+__all__ = ["NO_NOISE", "LabelNoise", "LevelMasks", "Recipe", "language_levels", "load_scene"]

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from vlgs.data.synthetic.objects import Thing, place
 from vlgs.data.synthetic.outdoors import surroundings
 from vlgs.data.synthetic.room import FLOOR, floor, table, wall
 from vlgs.data.synthetic.scene_file import SceneFile
-from vlgs.data.synthetic.things import Thing, place
 
 DIFFICULTIES = ("easy", "hard")
 

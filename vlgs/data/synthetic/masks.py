@@ -26,7 +26,7 @@ _FATES, _NOISE, _BORDERS, _LAYING = range(4)  # purposes of draws
 
 
 @dataclass(frozen=True)
-class Faults:
+class LabelNoise:
     """How often and how much supervision errs; a rate that is None is the difficulty's own (see `resolve`)."""
 
     missed: float | None = None
@@ -43,24 +43,24 @@ class Faults:
     def __post_init__(self):
         rates = [r or 0.0 for r in (self.missed, self.merged, self.mislabelled)]
         if min(rates) < 0 or sum(rates) > 1:
-            raise ValueError(f"Faults: rates must be >= 0 with a sum <= 1, got {rates}")
+            raise ValueError(f"LabelNoise: rates must be >= 0 with a sum <= 1, got {rates}")
         for name, value in (("noise", self.noise), ("ragged", self.ragged)):
             if value is not None and not 0 <= value < 100:
-                raise ValueError(f"Faults: {name} must be in [0, 100), got {value}")
+                raise ValueError(f"LabelNoise: {name} must be in [0, 100), got {value}")
 
-    def resolve(self, difficulty: str) -> "Faults":
+    def resolve(self, difficulty: str) -> "LabelNoise":
         """These faults with every None replaced by the value that belongs to ``easy`` or ``hard``."""
         own = {
-            "easy": Faults(0.05, 0.03, 0.05, 0.3, 1.0),
-            "hard": Faults(0.10, 0.06, 0.10, 0.6, 1.6),
+            "easy": LabelNoise(0.05, 0.03, 0.05, 0.3, 1.0),
+            "hard": LabelNoise(0.10, 0.06, 0.10, 0.6, 1.6),
         }
         filled = {
             k: v if v is not None else vars(own[difficulty])[k] for k, v in vars(self).items()
         }
-        return Faults(**filled)
+        return LabelNoise(**filled)
 
 
-NO_FAULTS = Faults(0.0, 0.0, 0.0, 0.0, 0.0)
+NO_NOISE = LabelNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 """Exact masks with exact vectors."""
 
 
@@ -86,7 +86,7 @@ def view_masks(
     regions: Mapping[int, Int[np.ndarray, "h w"]],
     names: Mapping[int, Mapping[int, Region]],
     words: tuple[str, ...],
-    faults: Faults,
+    faults: LabelNoise,
     key: tuple[int, ...],
 ) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
     """Supervision of one view at levels 0, 1, 2 and 3.
@@ -120,7 +120,7 @@ def _level_masks(
     regions: Int[np.ndarray, "h w"],
     names: Mapping[int, Region],
     words: tuple[str, ...],
-    faults: Faults,
+    faults: LabelNoise,
     key: tuple[int, ...],
 ) -> LevelMasks:
     ragged = _displace(regions, faults.ragged or 0.0, np.random.default_rng([_BORDERS, *key]))

@@ -1,8 +1,8 @@
 """Surroundings in which a camera can go wrong: a sky and a plain wall, on which structure from motion finds no point."""
 
+from vlgs.data.synthetic.objects import Material, Part, Thing
 from vlgs.data.synthetic.patterns import Cells, Gradient
 from vlgs.data.synthetic.shapes import Box, cylinder, sphere
-from vlgs.data.synthetic.things import Material, Part, Thing
 
 STAGES = ("ring", "sky", "wall")
 """Other stages than the room that is seen from a walk: the room, seen from a ring; under a sky, from a ring; before a plain wall, from an

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
+from vlgs.data.synthetic.objects import Material, Part, turn
 from vlgs.data.synthetic.patterns import (
     Bands,
     Cells,
@@ -25,7 +26,6 @@ from vlgs.data.synthetic.shapes import (
     sphere,
     turned,
 )
-from vlgs.data.synthetic.things import Material, Part, turn
 from vlgs.data.untrusted.nodes import Node
 
 Colors = Mapping[str, Color]

@@ -5,7 +5,7 @@ from dataclasses import astuple, dataclass, field
 
 from vlgs.data.synthetic import outdoors
 from vlgs.data.synthetic.layouts import DIFFICULTIES
-from vlgs.data.synthetic.masks import Faults
+from vlgs.data.synthetic.masks import LabelNoise
 from vlgs.data.synthetic.scene_file import SceneFile, find_scene
 
 VERSION = 1
@@ -26,7 +26,7 @@ class Recipe:
     test_views: int = 8
     seed: int = 0
     points: int = 4000
-    faults: Faults = field(default_factory=Faults)
+    faults: LabelNoise = field(default_factory=LabelNoise)
 
     def __post_init__(self):
         if self.difficulty not in DIFFICULTIES:

@@ -3,9 +3,9 @@
 World axes: z up, the table top is z = 0, metres. Most cameras stand on the side of negative y.
 """
 
+from vlgs.data.synthetic.objects import Material, Part, Thing
 from vlgs.data.synthetic.patterns import Bands, Cells, Plain, Wood
 from vlgs.data.synthetic.shapes import Box, cylinder
-from vlgs.data.synthetic.things import Material, Part, Thing
 
 TABLE_RADIUS = 0.72
 FLOOR = -0.72

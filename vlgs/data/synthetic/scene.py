@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from vlgs.data.synthetic.capture import Capture, Shot, open_capture, regions
 from vlgs.data.synthetic.labels import dense_labels, object_labels
 from vlgs.data.synthetic.language import vocabulary
-from vlgs.data.synthetic.masks import Faults, LevelMasks, view_masks
+from vlgs.data.synthetic.masks import LabelNoise, LevelMasks, view_masks
 from vlgs.data.synthetic.photographs import Photograph, photograph
 from vlgs.data.synthetic.points import view_points
 from vlgs.data.synthetic.recipe import MAX_VIEWS, Recipe
 from vlgs.data.synthetic.scene_file import find_scene
-from vlgs.data.synthetic.studio import Shot, Studio, open_studio, regions
 from vlgs.types import Camera, Scene, View
 
 _POINTS = 102  # purpose of draws
@@ -32,7 +32,7 @@ def load_scene(
     seed: int = 0,
     points: int = 4000,
     level: int = 3,
-    faults: Faults = Faults(),  # noqa: B008 (frozen)
+    faults: LabelNoise = LabelNoise(),  # noqa: B008 (frozen)
     cache: str | None = None,
 ) -> Scene:
     """A procedural scene, ray-traced and held in memory.
@@ -62,7 +62,7 @@ def load_scene(
     file = find_scene(scene)
     recipe = Recipe(file, difficulty, width, height, train_views, test_views, seed, points, faults)
     folder = None if cache is None else Path(cache)
-    studio = open_studio(recipe, folder)
+    capture = open_capture(recipe, folder)
     indices, vectors, offset = {}, [], 0
     for name, levels in language_levels(recipe, folder).items():
         masks = levels[level]
@@ -73,21 +73,21 @@ def load_scene(
     for index in indices.values():
         areas += np.bincount(index[index >= 0], minlength=offset)
     cloud = [
-        view_points(studio.world, shot.camera, shot.photo, count, _draws(recipe, shot))
-        for shot, count in zip(studio.train, _shares(points, train_views), strict=True)
+        view_points(capture.world, shot.camera, shot.photo, count, _draws(recipe, shot))
+        for shot, count in zip(capture.train, _shares(points, train_views), strict=True)
     ]
     return Scene(
         name=file.name,
-        train=tuple(_view(studio, shot, indices[shot.name]) for shot in studio.train),
-        test=tuple(_view(studio, shot, None) for shot in studio.test),
+        train=tuple(_view(capture, shot, indices[shot.name]) for shot in capture.train),
+        test=tuple(_view(capture, shot, None) for shot in capture.test),
         split="synthetic",
         points=torch.cat([xyz for xyz, _ in cloud]),
         point_colors=torch.cat([rgb for _, rgb in cloud]),
         mask_vectors=torch.from_numpy(np.concatenate(vectors)),
         mask_areas=torch.from_numpy(areas).float(),
-        classes=studio.classes,
-        class_kinds={thing.name: thing.kind for thing in studio.world.things if thing.masked},
-        vocabulary=vocabulary(studio.classes),
+        classes=capture.classes,
+        class_kinds={thing.name: thing.kind for thing in capture.world.things if thing.masked},
+        vocabulary=vocabulary(capture.classes),
         supervise=lambda camera, number: _supervise(recipe, folder, level, camera, number),
         fingerprint=recipe.fingerprint(level),
     )
@@ -97,8 +97,8 @@ def language_levels(
     recipe: Recipe, cache: Path | None = None
 ) -> Mapping[str, tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]]:
     """Supervision of every training view at levels 0 to 3, by view name; what `write_scene` puts on disk."""
-    studio = open_studio(recipe, cache)
-    return {shot.name: _levels(recipe, studio, shot.photo, shot.number) for shot in studio.train}
+    capture = open_capture(recipe, cache)
+    return {shot.name: _levels(recipe, capture, shot.photo, shot.number) for shot in capture.train}
 
 
 def _supervise(
@@ -108,25 +108,27 @@ def _supervise(
 
     Real extractors would also stumble over the faults of the render.
     """
-    studio = open_studio(recipe, cache)
-    photo = photograph(studio.world, camera)
-    masks = _levels(recipe, studio, photo, MAX_VIEWS + 1 + number)[level]
+    capture = open_capture(recipe, cache)
+    photo = photograph(capture.world, camera)
+    masks = _levels(recipe, capture, photo, MAX_VIEWS + 1 + number)[level]
     return torch.from_numpy(masks.index.astype(np.int32)), torch.from_numpy(masks.vectors)
 
 
 def _levels(
-    recipe: Recipe, studio: Studio, photo: Photograph, number: int
+    recipe: Recipe, capture: Capture, photo: Photograph, number: int
 ) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
     faults = recipe.faults.resolve(recipe.difficulty)
     key = (recipe.seed, zlib.crc32(f"{recipe.scene.key} {recipe.difficulty}".encode()), number)
-    return view_masks(*regions(studio.world, photo), studio.classes, faults, key)
+    return view_masks(*regions(capture.world, photo), capture.classes, faults, key)
 
 
-def _view(studio: Studio, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:
+def _view(capture: Capture, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:
     photo = shot.photo
-    ids = studio.class_of_part[photo.part]
-    things = studio.world.thing_of_part[photo.part]
-    asked = {studio.classes.index(t.name): t.name for t in studio.world.things if not t.background}
+    ids = capture.class_of_part[photo.part]
+    things = capture.world.thing_of_part[photo.part]
+    asked = {
+        capture.classes.index(t.name): t.name for t in capture.world.things if not t.background
+    }
     smallest = max(4, round(5e-4 * ids.size))
     return View(
         name=shot.name,

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlgs.data.synthetic.language import NEGATIVES
+from vlgs.data.synthetic.objects import OTHER, TRANSLUCENT_REFLECTIVE, Thing
 from vlgs.data.synthetic.outdoors import STAGES
 from vlgs.data.synthetic.parts import Colors, read_color, read_part
 from vlgs.data.synthetic.room import TABLE_RADIUS
-from vlgs.data.synthetic.things import OTHER, TRANSLUCENT_REFLECTIVE, Thing
 from vlgs.data.untrusted.nodes import Node, read_yaml
 
 _FOLDER = Path(__file__).parent

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
+from vlgs.data.synthetic.objects import Part, Thing
 from vlgs.data.synthetic.room import FLOOR, LAMP, ROOM, TABLE_RADIUS
 from vlgs.data.synthetic.shapes import Vectors
-from vlgs.data.synthetic.things import Part, Thing
 
 NOTHING = 255
 """Part number of a ray that hits nothing; does not happen from inside the room."""

@@ -1,14 +1,14 @@
 """Readers for files from others. A damaged or hostile file gives one error, which says which file, where, what and what to do.
 
 Sizes that a file declares (elements, pixels, arrays) are compared with its length before memory is allocated: a small file
-needs little memory and little time. Every error is a `vlgs.data.faults.SceneError`.
+needs little memory and little time. Every error is a `vlgs.data.diagnostics.SceneError`.
 """
 
 import os
 import stat
 from pathlib import Path
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 
 COPY_AGAIN = "the file is truncated or damaged: copy it again"
 

@@ -11,7 +11,7 @@ from types import TracebackType
 
 import numpy as np
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.untrusted import COPY_AGAIN, file_size
 
 _MAGIC = b"\x93NUMPY"

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.untrusted.text import read_text
 
 LONGEST, DEEPEST = 1 << 20, 20

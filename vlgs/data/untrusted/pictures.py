@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.untrusted import COPY_AGAIN, file_size
 
 _FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP")

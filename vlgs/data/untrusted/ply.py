@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.untrusted import COPY_AGAIN, file_size, read_bytes
 
 _LONGEST_HEADER = 1 << 18

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from vlgs.data.faults import Fault, SceneError
+from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.untrusted import COPY_AGAIN, read_bytes
 
 _SURROGATE = re.compile(r"\\u[dD][89abAB]|\\u[dD][c-fC-F]")

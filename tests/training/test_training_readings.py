@@ -1,0 +1,145 @@
+"""Options for what the paper leaves open (conf/README.md): each does what its name says."""
+
+from dataclasses import fields, replace
+
+import jaxtyping
+import pytest
+import torch
+from tiny_runs import TINY, composed
+
+from vlgs.config import instantiate
+from vlgs.geometry import camera_center
+from vlgs.training.build import Parts, build_module
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.settings import LearningRates, TrainerConfig
+from vlgs.types import Scene
+from vlgs.view_blend import BetaBlend, blend_camera
+
+
+def module_of(scene: Scene, *overrides: str) -> VLGSModule:
+    config = composed(*TINY, "trainer=smoke", *overrides)
+    torch.manual_seed(config.seed)
+    parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+    return build_module(scene, parts, config.seed)
+
+
+def with_harmonics(module: VLGSModule, size: float) -> VLGSModule:
+    splats = module.model.splats
+    rng = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        splats["shN"].copy_(size * torch.randn(splats["shN"].shape, generator=rng))
+        splats["features"].copy_(torch.rand(splats["features"].shape, generator=rng))
+    module.model.sh_degree = 3
+    return module
+
+
+def test_rgb_has_no_harmonics(tiny_scene: Scene):
+    module = module_of(tiny_scene, "gaussians.color=rgb")
+    assert module.model.splats["shN"].shape[1:] == (0, 3)
+    module.set_schedule(10_000)
+    assert module.model.sh_degree == 0
+
+
+@pytest.mark.parametrize("color", ["rgb_dc", "evaluated"])
+def test_only_evaluated_colour_makes_language_depend_on_the_harmonics(
+    tiny_scene: Scene, color: str
+):
+    camera = tiny_scene.test[0].camera
+    overrides = f"gaussians.color={color}", "fusion=mlp", "fusion.residual=false"
+    flat, bright = (with_harmonics(module_of(tiny_scene, *overrides), s) for s in (0.0, 0.5))
+    one, two = (module.model.render(camera) for module in (flat, bright))
+    assert one.color is not None
+    assert two.color is not None
+    assert one.feature is not None
+    assert two.feature is not None
+    assert not torch.equal(one.color, two.color)
+    assert torch.equal(one.feature, two.feature) == (color == "rgb_dc")
+
+
+def test_without_harmonics_all_three_are_one(tiny_scene: Scene):
+    camera = tiny_scene.test[0].camera
+    images = []
+    for color in ("rgb_dc", "rgb", "evaluated"):
+        module = module_of(tiny_scene, f"gaussians.color={color}", "fusion=mlp")
+        images.append(module.model.render(camera))
+    for image in images[1:]:
+        torch.testing.assert_close(image.color, images[0].color, rtol=0, atol=0)
+        torch.testing.assert_close(image.feature, images[0].feature, rtol=0, atol=0)
+
+
+def test_lifted_codes_are_the_weighted_means_of_what_is_seen(tiny_scene: Scene):
+    few = replace(tiny_scene, train=tiny_scene.train[:2])
+    module = module_of(few, "gaussians.init_features=lifted")
+    model = module.model
+    n = model.count
+    weight = model.fuse().language_weight.detach()
+    above = torch.zeros(n, 3)
+    below = torch.zeros(n)
+    for index, view in enumerate(few.train):
+        target = module.views[index]
+        assert target.codes is not None
+        assert target.valid is not None
+        blended = model.render_values(view.camera, torch.eye(n), weight)[target.valid].detach()
+        above += blended.T @ target.codes[target.valid]
+        below += blended.sum(dim=0)
+    seen = below > 1e-4
+    assert 0 < seen.sum() <= n
+    want = above[seen] / below[seen, None]
+    torch.testing.assert_close(model.splats["features"][seen].detach(), want, rtol=1e-3, atol=1e-4)
+    assert not model.splats["features"][below == 0].any()
+
+
+def test_positions_slow_down_over_the_steps_they_are_given():
+    rates = LearningRates()
+    whole = TrainerConfig(1000, rates)
+    longer = TrainerConfig(1000, rates, means_steps=2000)
+    assert whole.means_rate(1000) == pytest.approx(rates.means_final)
+    assert longer.means_rate(1000) == pytest.approx((rates.means * rates.means_final) ** 0.5)
+    with pytest.raises(ValueError, match="means_steps must be at least 1, got 0"):
+        TrainerConfig(1000, rates, means_steps=0)
+
+
+@pytest.mark.parametrize("k", [0.2, 0.8])
+def test_what_is_not_blended_stays_that_of_the_nearer_view(tiny_scene: Scene, k: float):
+    one, two = tiny_scene.train[0].camera, tiny_scene.train[3].camera
+    nearer = one if k > 0.5 else two
+    moved = blend_camera(one, two, k, BetaBlend(rotation=False, kept="nearer"))
+    torch.testing.assert_close(moved.viewmat[:3, :3], nearer.viewmat[:3, :3])
+    centers = [camera_center(camera.viewmat) for camera in (one, two)]
+    want = k * centers[0] + (1 - k) * centers[1]
+    torch.testing.assert_close(camera_center(moved.viewmat), want, atol=1e-5, rtol=0)
+    turned = blend_camera(one, two, k, BetaBlend(translation=False, kept="nearer"))
+    torch.testing.assert_close(
+        camera_center(turned.viewmat), camera_center(nearer.viewmat), atol=1e-5, rtol=0
+    )
+    first = blend_camera(one, two, k, BetaBlend(rotation=False))
+    torch.testing.assert_close(first.viewmat[:3, :3], one.viewmat[:3, :3])
+
+
+def test_pairs_of_neighbours(tiny_scene: Scene):
+    module = module_of(tiny_scene, "blend.pairs=neighbours", "blend.neighbours=1")
+    near = module.views.sampler.near
+    assert near is not None
+    for step in range(12):
+        first, second = module.views.sampler.pair(step)
+        assert near[first] == (second,)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("gaussians.color=hsv", "color must be rgb_dc or rgb or evaluated, got hsv"),
+        ("gaussians.init_features=random", "init_features must be zero or lifted, got random"),
+        ("blend.kept=second", "kept must be one of first, nearer, got 'second'"),
+        ("blend.pairs=near", "pairs must be one of uniform, neighbours, got 'near'"),
+        ("blend.neighbours=0", "neighbours must be at least 1, got 0"),
+    ],
+)
+def test_a_slip_is_named(
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, override: str, message: str
+):
+    monkeypatch.setattr(
+        jaxtyping.config, "jaxtyping_disable", True
+    )  # the annotation would be first
+    with pytest.raises(ValueError, match=message):
+        module_of(tiny_scene, override)

@@ -1,0 +1,140 @@
+"""All photographs of a scene, and the exact masks in them. They are rendered once."""
+
+import functools
+import io
+import logging
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
+from vlgs.data.synthetic.layouts import build
+from vlgs.data.synthetic.masks import NO_NOISE, Region
+from vlgs.data.synthetic.photographs import Photograph, photograph
+from vlgs.data.synthetic.recipe import Recipe
+from vlgs.data.synthetic.world import World
+from vlgs.data.untrusted.arrays import Archive
+from vlgs.files import write_atomically
+from vlgs.types import IGNORE_ID, Camera
+
+log = logging.getLogger(__name__)
+
+_LAYOUT, _WALK = 100, 101  # purposes of draws; `masks` and `scene` have others
+_PATCHES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph with its place in the walk."""
+
+    name: str
+    number: int
+    """Among the training views, or among the held-out ones."""
+    camera: Camera
+    photo: Photograph
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What does not depend on faults, points and level."""
+
+    world: World
+    classes: tuple[str, ...]
+    class_of_part: np.ndarray
+    train: tuple[Shot, ...]
+    test: tuple[Shot, ...]
+
+
+def open_capture(recipe: Recipe, cache: Path | None = None) -> Capture:
+    """Build and photograph, or find the photographs; sweeps over levels, faults and methods ask for the same ones again.
+
+    Args:
+        recipe: Of the scene; its points and faults do not matter here.
+        cache: Folder that keeps photographs between processes; None: they are kept in memory only.
+    """
+    return _open(replace(recipe, points=0, faults=NO_NOISE), cache)
+
+
+@functools.lru_cache(maxsize=2)
+def _open(recipe: Recipe, cache: Path | None) -> Capture:
+    things = build(recipe.scene, recipe.difficulty, np.random.default_rng([_LAYOUT, recipe.seed]))
+    world = World(things)
+    classes = tuple(dict.fromkeys(thing.name for thing in things if thing.masked))
+    class_of_thing = np.array(
+        [classes.index(thing.name) if thing.masked else IGNORE_ID for thing in things], np.uint8
+    )
+    train, test = moments(recipe.train_views, recipe.test_views)
+    order = np.argsort(np.argsort(np.concatenate([train, test])))
+    places = []
+    for position, moment in zip(
+        order.tolist(), np.concatenate([train, test]).tolist(), strict=True
+    ):
+        held_out = len(places) >= recipe.train_views
+        number = len(places) - recipe.train_views * held_out
+        rng = np.random.default_rng([_WALK, recipe.seed, int(held_out), number])
+        if not recipe.scene.outdoors:
+            camera = camera_at(moment, rng, recipe.width, recipe.height)
+        else:
+            stop = stop_at(
+                recipe.scene.stage, number, recipe.train_views, recipe.test_views if held_out else 0
+            )
+            camera = held(stop, rng, recipe.width, recipe.height)
+        places.append((f"frame_{position + 1:05d}", number, camera))
+    photos = _photographs(world, [camera for *_, camera in places], recipe, cache)
+    shots = [Shot(n, k, c, photo) for (n, k, c), photo in zip(places, photos, strict=True)]
+    return Capture(
+        world,
+        classes,
+        class_of_thing[world.thing_of_part],
+        tuple(shots[: recipe.train_views]),
+        tuple(shots[recipe.train_views :]),
+    )
+
+
+def _photographs(
+    world: World, cameras: list[Camera], recipe: Recipe, cache: Path | None
+) -> list[Photograph]:
+    if cache is None:
+        return [photograph(world, camera) for camera in cameras]
+    file = cache / f"capture-{recipe.fingerprint(level=0)}.npz"
+    names = [field.name for field in fields(Photograph)]
+    try:
+        with Archive(file, "photographs of the scene") as kept:
+            stacks = [kept.read(name, "fiub") for name in names]
+        return [Photograph(*arrays) for arrays in zip(*stacks, strict=True)]
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
+    photos = [photograph(world, camera) for camera in cameras]
+    content = io.BytesIO()
+    stacks = {name: np.stack([getattr(photo, name) for photo in photos]) for name in names}
+    np.savez(content, **stacks)  # pyright: ignore[reportArgumentType] (names are not allow_pickle)
+    cache.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, content.getvalue())
+    return photos
+
+
+def regions(
+    world: World, photo: Photograph
+) -> tuple[dict[int, Int[np.ndarray, "h w"]], dict[int, dict[int, Region]]]:
+    """Region number per pixel, and what the regions are, at levels 1 (subpart), 2 (part) and 3 (whole)."""
+    part = photo.part.astype(np.int64)
+    numbers = {3: world.thing_of_part[part], 2: part, 1: part * _PATCHES + photo.patch}
+    findable = np.array([thing.masked for thing in world.things])[numbers[3]]
+    place = np.concatenate([np.arange(len(thing.parts)) for thing in world.things])
+
+    def region(level: int, number: int) -> Region:
+        if level == 3:
+            return Region(world.things[number].name, "whole")
+        part, patch = (number, None) if level == 2 else divmod(number, _PATCHES)
+        word = world.things[world.thing_of_part[part]].name
+        return Region(word, f"{word}, part {place[part]}, patch {patch}")
+
+    names = {
+        level: {n: region(level, n) for n in np.unique(found[findable]).tolist()}
+        for level, found in numbers.items()
+    }
+    return numbers, names

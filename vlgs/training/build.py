@@ -1,0 +1,134 @@
+"""Builds a module that is ready to train from a scene and the chosen parts."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+
+import torch
+from torch import Tensor
+
+from vlgs.data.sampler import PairSampler, nearest_views
+from vlgs.fields.splat import SplatModel
+from vlgs.formats import load_weights, start_from
+from vlgs.fusion import Fusion
+from vlgs.fusion.none import NoFusion
+from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
+from vlgs.gaussians.background import with_background
+from vlgs.heads import Head
+from vlgs.heads.autoencoder import Autoencoder
+from vlgs.indicator import Indicator, PerLevel
+from vlgs.objectives import Objective, Setup
+from vlgs.objectives.targets import TrainingViews
+from vlgs.skip_count import SkipCount
+from vlgs.training.lift import lift_features
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.settings import SkipConfig, TrainerConfig
+from vlgs.types import RasterConfig, Scene
+from vlgs.view_blend import ViewBlend
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The chosen parts of a run; one field per configuration group."""
+
+    gaussians: GaussiansConfig
+    sharing: Sharing
+    fusion: Fusion
+    indicator: Indicator
+    blend: ViewBlend
+    head: Head
+    loss: Mapping[str, Objective]
+    """Name -> objective."""
+    raster: RasterConfig
+    trainer: TrainerConfig
+
+
+def build_module(
+    scene: Scene,
+    parts: Parts,
+    seed: int,
+    color: bool = True,
+    start: Mapping[str, Tensor] | None = None,
+) -> VLGSModule:
+    """Fit the head, place the Gaussians and put everything together.
+
+    Args:
+        scene: What is learned.
+        parts: How.
+        seed: Of all draws.
+        color: Off: language alone.
+        start: Raw parameters to start from; None: those of ``gaussians.init``, or the scene's points.
+
+    Raises:
+        ValueError: If the scene has no training view.
+    """
+    if not scene.train:
+        raise ValueError(f"train: training views of {scene.name} must be at least 1, got 0")
+    fusion, head, config = parts.fusion, parts.head, parts.gaussians
+    if scene.mask_vectors.shape[0] > 0:
+        if isinstance(head, Autoencoder) and head.weights is not None:
+            load_weights(head, head.weights)
+        else:
+            head.fit(scene.mask_vectors, scene.mask_areas)
+    else:
+        log.info("no language supervision: training colour only, without fusion or blended views")
+        # Indicators that nothing trains would keep every Gaussian alive.
+        fusion = NoFusion()
+        config = replace(config, prune_on="opacity")
+    width = head.dim * scene.mask_levels
+    language = scene.mask_vectors.shape[0] > 0
+    own = language and parts.sharing.own_shape
+    several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
+    levels = scene.mask_levels if several else None
+    attributes = attributes_of(config, width, levels, own, asdict(parts.trainer.learning_rates))
+    if start is not None:
+        parameters = conform(start, attributes)
+    elif config.init is not None:
+        parameters = start_from(config.init, attributes)
+    else:
+        first = initialise(scene, config, attributes, seed)
+        parameters = with_background(first, scene, config.background, attributes)
+    model = SplatModel(
+        parameters,
+        fusion,
+        parts.indicator,
+        head,
+        parts.raster,
+        sh_degree=0,
+        evaluated=config.color == "evaluated",
+        attributes=attributes,
+    )
+    objectives = {n: o for n, o in parts.loss.items() if color or "color" not in o.needs}
+    setup = bind(objectives, scene, model, parts.blend, parts.trainer.skip, seed)
+    module = VLGSModule(model, setup, config, parts.trainer, seed)
+    if config.init_features == "lifted":
+        lift_features(module)
+    return module
+
+
+def bind(
+    objectives: Mapping[str, Objective],
+    scene: Scene,
+    model: SplatModel,
+    blend: ViewBlend,
+    skip: SkipConfig,
+    seed: int,
+) -> Setup:
+    """Show a scene to objectives, with the targets that the model's head makes of its masks."""
+    cameras = [view.camera for view in scene.train]
+    near = nearest_views(cameras, blend.neighbours) if blend.pairs == "neighbours" else None
+    sampler = PairSampler(tuple((c.width, c.height) for c in cameras), seed, near)
+    codes = torch.zeros(0, model.splats["features"].shape[1])
+    if len(scene.mask_vectors) > 0:
+        with torch.no_grad():
+            codes = model.head.targets(scene.mask_vectors)
+    counts = SkipCount()
+    views = TrainingViews(scene, codes, sampler, counts)
+    setup = Setup(
+        views, model.predict, objectives, blend, skip.blend_weight, skip.blend_reuse, counts
+    )
+    for objective in objectives.values():
+        objective.bind(setup)
+    return setup

@@ -1,0 +1,122 @@
+"""Training with frozen geometry: everything about a view that stays constant is computed once."""
+
+from collections.abc import Hashable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.fields.cached_weights import FrozenViews
+from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
+from vlgs.ops.cached_weights import FrozenView
+from vlgs.skip_count import SkipCount
+from vlgs.types import Camera, Covariance
+
+
+def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None:
+    """Turn off the gradients of the parameters that are to be kept.
+
+    Raises:
+        ValueError: If a name is unknown, or Gaussians would still multiply and die, or their weights be reset.
+    """
+    unknown = sorted(set(names) - set(model.splats))
+    if unknown:
+        raise ValueError(
+            f"train: trainer.freeze must name some of {', '.join(model.splats)}, got {unknown}"
+        )
+    if names and densify_stop > 0:
+        raise ValueError(
+            "train: gaussians.densify.stop must be 0 where trainer.freeze keeps parameters, or densification moves "
+            f"them, got {densify_stop}"
+        )
+    for name in names:
+        model.splats[name].requires_grad_(False)
+
+
+def has_frozen_shape(model: SplatModel) -> bool:
+    """Whether positions, rotations and scales keep their values."""
+    shape = ("position", "rotation", "scale")
+    rows = (row.name for row in model.attributes.values() if row.role in shape)
+    return not any(model.splats[name].requires_grad for name in rows)
+
+
+class FrozenRenders:
+    """Renders the training views from kept blending weights, as far as these are constant.
+
+    Args:
+        model: Whose means, quats and scales do not change.
+        budget: Bytes for the weights of all views.
+        counts: Where work done and left out is counted.
+    """
+
+    def __init__(self, model: SplatModel, budget: int, counts: SkipCount) -> None:
+        self.model = model
+        self.views = FrozenViews(budget)
+        self.counts = counts
+        self._colors: dict[int, Tensor] = {}
+
+    def render(
+        self, index: int, camera: Camera, language: bool, fused: FusedGaussians
+    ) -> ViewRender | None:
+        """A training view in colour, and in language if wanted; None where it must be rendered in full."""
+        opacities = fused.gaussians.opacities
+        if opacities.requires_grad or (language and fused.language_weight.requires_grad):
+            return None
+        if language and fused.language_weight.dim() == 2:  # as many views as there are indicators
+            return None
+        shape = Covariance(fused.gaussians.quats, fused.gaussians.scales)
+        own = fused.gaussians.language_shape
+        by_color = self._view((index, "opacity"), camera, opacities, shape, fused)
+        by_language = by_color
+        if language and (fused.language_weight is not opacities or own is not None):
+            weight = fused.language_weight
+            by_language = self._view((index, "language"), camera, weight, own or shape, fused)
+        if by_color is None or by_language is None:
+            return None
+        return ViewRender(
+            color=self._color(index, camera, by_color, fused),
+            feature=by_language.render(fused.feature) if language else None,
+            alpha_color=by_color.alpha,
+            alpha_language=by_language.alpha if language else None,
+            visible=by_color.visible | by_language.visible,
+            mean2d=by_color.mean2d,
+        )
+
+    def _view(
+        self,
+        name: Hashable,
+        camera: Camera,
+        weight: Float[Tensor, " n"],
+        shape: Covariance,
+        fused: FusedGaussians,
+    ) -> FrozenView | None:
+        view = self.views.get(name)
+        if view is not None:
+            self.counts.skip("frozen_weights")
+            return view
+        if self.views.refused(name):
+            return None
+        with self.counts.doing("weights"):
+            return self.views.make(
+                name,
+                means=fused.gaussians.means,
+                quats=shape.quats,
+                scales=shape.scales,
+                weight=weight,
+                camera=camera,
+                config=self.model.raster,
+            )
+
+    def _color(
+        self, index: int, camera: Camera, view: FrozenView, fused: FusedGaussians
+    ) -> Float[Tensor, "h w 3"]:
+        """The colour image; kept too where nothing that it depends on is trained."""
+        if index in self._colors:
+            self.counts.skip("frozen_color")
+            return self._colors[index]
+        values = self.model.view_color(fused, camera)
+        if values.requires_grad:
+            return view.render(values)
+        with self.counts.doing("color render"), torch.no_grad():
+            self._colors[index] = view.render(values)
+        return self._colors[index]

@@ -1,0 +1,44 @@
+"""Language codes lifted from the training views onto Gaussians, without training."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vlgs.training.lightning import VLGSModule
+
+
+def lift_features(module: VLGSModule) -> None:
+    """Start the codes at ``f_i = sum_p w_ip H_p / sum_p w_ip`` over the masked pixels p of all training views, in place.
+
+    w_ip is the blending weight of Gaussian i at pixel p. Gaussians that no masked pixel sees keep the code they have. One backward
+    pass per view and mask level, as the sums are the gradient of the image by what is blended.
+    """
+    features, levels = module.model.splats["features"], module.model.levels
+    with torch.no_grad():
+        weight = module.model.fuse().language_weight
+    weights = [weight] * levels if weight.dim() == 1 else [w.contiguous() for w in weight.unbind(1)]
+    total = features.new_zeros(levels, len(features), features.shape[1] // levels + 1)
+    for index in range(len(module.views.scene.train)):
+        target = module.views[index]
+        if target.codes is None or target.valid is None:
+            continue
+        seen = target.valid[..., None].to(features)
+        image = torch.cat([target.codes * seen, seen], dim=-1)
+        for level, own in enumerate(weights):
+            total[level] += gathered(module, index, own, image[:, level::levels].contiguous())
+    with torch.no_grad():
+        codes = features.unflatten(1, (levels, -1)).transpose(0, 1)
+        lifted = total[..., :-1] / total[..., -1:].clamp_min(torch.finfo(total.dtype).tiny)
+        lifted = torch.where(total[..., -1:] > 0, lifted, codes)
+        features.copy_(lifted.transpose(0, 1).flatten(1))
+
+
+def gathered(
+    module: VLGSModule, index: int, weight: Float[Tensor, " n"], image: Float[Tensor, "h w c"]
+) -> Float[Tensor, "n c"]:
+    """Per Gaussian the sum over pixels of its blending weight times the image."""
+    values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
+    camera = module.views.scene.train[index].camera
+    with torch.enable_grad():
+        rendered = module.model.render_values(camera, values, weight)
+        return torch.autograd.grad(rendered, values, image)[0]

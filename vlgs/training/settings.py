@@ -1,0 +1,104 @@
+"""Settings of a training run, mirrored by conf/trainer."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+
+from vlgs.values import require_range
+
+MOST_ITERATIONS = 10**9
+"""Upper limit of `iterations`, far above any useful value."""
+
+SMALLEST_RATE = 1e-30
+"""Above 0; the decay from one rate to another would leave the range of floats beyond it."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's rates per parameter (Table 7), 0 to 1; rates the paper does not give are marked. What has a rate of 0 does not learn."""
+
+    means: float = 1.6e-4
+    """Multiplied by the scene extent, decays log-linearly to `means_final` over `TrainerConfig.means_steps`."""
+    means_final: float = 1.6e-6
+    """3DGS's final rate; the paper is silent (conf/README.md, D.11)."""
+    quats: float = 1e-3
+    log_scales: float = 5e-3
+    sh0: float = 5e-3
+    shN: float = 2.5e-4  # noqa: N815 (gsplat's name)
+    """sh0's rate / 20 as in 3DGS; the paper is silent (conf/README.md, D.7)."""
+    opacity_logits: float = 5e-2
+    indicator_logits: float = 5e-2
+    features: float = 5e-3
+    fusion: float = 1e-3
+    """The paper is silent (conf/README.md, D.6)."""
+
+    exposure: float = 1e-3
+    """Of the maps of `TrainerConfig.exposure`; 3DGS's last."""
+
+    def __post_init__(self) -> None:
+        require_range("learning_rates", 0, 1, **asdict(self))
+        for name, rate in asdict(self).items():
+            if 0 < rate < SMALLEST_RATE:
+                raise ValueError(
+                    f"learning_rates: {name} must be 0 or {SMALLEST_RATE:g} to 1, got {rate}"
+                )
+
+
+@dataclass(frozen=True)
+class SkipConfig:
+    """Work of an iteration that is left out; `vlgs.skips` says what each costs in accuracy."""
+
+    blend_weight: float = 0.0
+    """Blended views with lambda * SSIM(I1, I2) up to this are not rendered; negative: every one is."""
+    blend_reuse: float = 0.0
+    """Blended views with min(k, 1 - k) below this take the language of the real view; 0: none."""
+    frozen_weights: bool = True
+    """Keep the blending weights of every view when geometry and weights are frozen."""
+    frozen_budget: int = 2 << 30
+    """Bytes that the kept weights of all views may take together."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.blend_reuse <= 0.5:
+            raise ValueError(f"skip: blend_reuse must be in [0, 0.5], got {self.blend_reuse}")
+        if not -float("inf") < self.blend_weight < float("inf"):
+            raise ValueError(f"skip: blend_weight must be finite, got {self.blend_weight}")
+        if self.frozen_budget < 0:
+            raise ValueError(f"skip: frozen_budget must be at least 0, got {self.frozen_budget}")
+
+
+@dataclass(frozen=True)
+class TrainerConfig:
+    """Budget and schedule of a run."""
+
+    iterations: int
+    learning_rates: LearningRates
+    sh_every: int = 1000
+    """Iterations after which the next spherical harmonics degree joins."""
+    means_steps: int | None = None
+    """Iterations over which the rate of the positions decays; None: all of the run (conf/README.md, D.11)."""
+    log_every: int = 50
+    checkpoint_every: int = 1000
+    """Iterations between checkpoints; 0 writes one only at the end."""
+    freeze: Sequence[str] = ()
+    """Parameters of the Gaussians that keep their values, by name (`vlgs.gaussians.attributes`)."""
+    exposure: bool = False
+    """Whether every training photograph has a gain, white balance and offset of its own (`vlgs.training.exposure`)."""
+    skip: SkipConfig = field(default_factory=SkipConfig)
+
+    def __post_init__(self) -> None:
+        require_range("trainer", 1, MOST_ITERATIONS, iterations=self.iterations)
+        if self.sh_every < 1 or self.log_every < 1 or self.checkpoint_every < 0:
+            raise ValueError(
+                "trainer: sh_every and log_every must be at least 1 and checkpoint_every at least 0, got "
+                f"{self.sh_every}, {self.log_every}, {self.checkpoint_every}"
+            )
+
+        if self.means_steps is not None and self.means_steps < 1:
+            raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
+
+    def means_rate(self, step: int) -> float:
+        """Learning rate of positions at a step, in units of the scene extent (3DGS's log-linear decay)."""
+        share = min(step / (self.means_steps or self.iterations), 1.0)
+        rates = self.learning_rates
+        if rates.means == 0 or rates.means_final == 0:
+            return rates.means * (1 - share) + rates.means_final * share  # no logarithm leads to 0
+        return rates.means * (rates.means_final / rates.means) ** share

@@ -1,0 +1,160 @@
+"""Where the models of a run are trained: each in a sub-folder of the run, with its own checkpoint and log.csv.
+
+A finished model is loaded from its checkpoint, so that the same command continues where it was stopped.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import torch
+
+from vlgs.fields import Field
+from vlgs.fields.splat import SplatModel
+from vlgs.fields.trained import SplatField
+from vlgs.runs import RunFolder
+from vlgs.skip_count import SkipCount
+from vlgs.training.build import Parts, build_module
+from vlgs.training.checkpoint import checkpoint_bytes, save_checkpoint
+from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lift import lift_features
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.state import capture
+from vlgs.types import Scene
+
+log = logging.getLogger(__name__)
+
+
+class StoppedError(Exception):
+    """Training was asked to stop; what was reached is saved."""
+
+    def __init__(self, signal: str, where: str) -> None:
+        super().__init__(f"{signal}: stopped and saved at {where}")
+
+
+@dataclass(frozen=True)
+class Made:
+    """One model of a run, and what it took to make it."""
+
+    folder: RunFolder
+    field: Field
+    gaussians: int
+    """How many it has."""
+    seconds: float
+    """Of training."""
+    skips: SkipCount
+    checkpoint_bytes: int
+    kept: bool = True
+    """Off: it only prepared others, and is no part of the result."""
+
+
+def unchanged(parts: Parts) -> Parts:
+    """The parts as the command line chose them."""
+    return parts
+
+
+@dataclass
+class Workshop:
+    """Makes models in sub-folders of a run, and remembers them.
+
+    Args:
+        folder: Of the run.
+        make_parts: Fresh parts, which hold weights; called once per model, with the same random numbers each time.
+        make_options: Likewise, as loggers belong to one training.
+        seed: Of the run.
+    """
+
+    folder: RunFolder
+    make_parts: Callable[[], Parts]
+    make_options: Callable[[], FitOptions]
+    seed: int
+    made: dict[str, Made] = field(default_factory=dict)
+    """Sub-folder -> model, in the order in which they were made."""
+
+    @property
+    def kept(self) -> list[Made]:
+        """The models that the result consists of."""
+        return [made for made in self.made.values() if made.kept]
+
+    def train(
+        self,
+        name: str,
+        scene: Scene,
+        change: Callable[[Parts], Parts] = unchanged,
+        start: SplatModel | None = None,
+        color: bool = True,
+        kept: bool = True,
+    ) -> SplatField:
+        """Train a model, or read it back.
+
+        Args:
+            name: Sub-folder; empty for the folder of the run itself.
+            scene: What it learns.
+            change: What is different from the parts that the command line chose.
+            start: Whose Gaussians it starts from; None: what the parts say.
+            color: Off: language alone.
+            kept: See `Made`.
+
+        Raises:
+            StoppedError: If it was asked to stop.
+        """
+        folder = self.folder.part(name)
+        if name:
+            log.info("model %s of this run, in %s", name, folder.path)
+        module = self._build(scene, change(self.make_parts()), start, color)
+        stopped_by = fit(module, folder, self.make_options())
+        if stopped_by is not None:
+            which = f" of {name}" if name else ""
+            where = f"step {module.next_step} of {module.settings.iterations}{which}"
+            raise StoppedError(stopped_by, where)
+        return self._remember(name, module, color, kept)
+
+    def lift(self, name: str, scene: Scene, start: SplatModel) -> SplatField:
+        """Lift the language of a scene onto finished Gaussians (`lift_features`); the folder is as that of a trained model.
+
+        Args:
+            name: Sub-folder; empty for the folder of the run itself.
+            scene: Whose masks count.
+            start: Trained on colour.
+        """
+        folder, started = self.folder.part(name), time.perf_counter()
+        module = self._build(scene, self.make_parts(), start)
+        module.model.sh_degree = start.sh_degree
+        lift_features(module)
+        module.next_step = module.settings.iterations
+        module.train_seconds = time.perf_counter() - started
+        folder.require_own()
+        save_checkpoint(folder.checkpoint, capture(module, self.make_options().meta))
+        return self._remember(name, module)
+
+    def _build(
+        self, scene: Scene, parts: Parts, start: SplatModel | None, color: bool = True
+    ) -> VLGSModule:
+        if start is None:
+            return build_module(scene, parts, self.seed, color)
+        # Copies: training moves them in place, and other models may start from the same ones.
+        splats = {name: value.detach().clone() for name, value in start.splats.items()}
+        width = parts.head.dim * scene.mask_levels
+        if splats["features"].shape[1] != width:
+            splats["features"] = torch.zeros(start.count, width)
+        return build_module(scene, parts, self.seed, color, splats)
+
+    def _remember(
+        self, name: str, module: VLGSModule, color: bool = True, kept: bool = True
+    ) -> SplatField:
+        folder, field = self.folder.part(name), SplatField(module.model, color)
+        size, seconds = checkpoint_bytes(folder.checkpoint), module.train_seconds
+        self.made[name] = Made(folder, field, module.model.count, seconds, module.skips, size, kept)
+        return field
+
+
+def all_skips(made: Iterable[Made]) -> SkipCount:
+    """The skips of several models together."""
+    total = SkipCount()
+    for one in made:
+        for name, work in one.skips.work.items():
+            total.add(name, work.done, work.seconds)
+        for name, count in one.skips.skipped.items():
+            total.skip(name, count)
+    return total
