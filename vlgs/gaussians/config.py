@@ -24,9 +24,6 @@ class DensifyConfig:
     """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
     prune_below: float = 0.005
     """Weight under which a Gaussian is removed; see `GaussiansConfig.prune_on`."""
-    clear_share: float = 0.9
-    """Gaussians that a training camera sees nearer than so many times its nearest sparse point are removed (`vlgs.gaussians.clearance`);
-    0: none are."""
     prune_large: bool = True
     """Whether Gaussians above `max_scale_share` are removed, once the first opacity reset has passed."""
     max_scale_share: float = 0.1
@@ -48,7 +45,6 @@ class DensifyConfig:
             dense_share=self.dense_share,
             max_scale_share=self.max_scale_share,
         )
-        require_range("densify", 0, 1, clear_share=self.clear_share)
         _require_inside_unit("densify", prune_below=self.prune_below, reset_to=self.reset_to)
         if self.reset_to <= self.prune_below:
             raise ValueError(

@@ -56,7 +56,6 @@ class Densification(L.Callback):
                 done,
                 densifying.centers,
                 module.model.attributes,
-                densifying.clearance.intruders(module.model.splats["means"]),
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)

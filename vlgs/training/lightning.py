@@ -10,7 +10,6 @@ from torch import Tensor
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
-from vlgs.gaussians.clearance import Clearance
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import FrozenRenders, freeze, has_frozen_shape
@@ -32,8 +31,6 @@ class Densifying:
     """`vlgs.geometry.scene_extent` of the training cameras."""
     centers: Float[Tensor, "v 3"]
     """Of the training cameras."""
-    clearance: Clearance
-    """What Gaussians must not enter."""
 
 
 class VLGSModule(L.LightningModule):
@@ -75,7 +72,6 @@ class VLGSModule(L.LightningModule):
             DensifyState.zeros(model.count),
             scene_extent(viewmats),
             camera_center(viewmats).float(),
-            Clearance(views.scene, config.densify.clear_share),
         )
         color = any("color" in objective.needs for objective in setup.objectives.values())
         keeps = settings.skip.frozen_weights and color and not model.evaluated
