@@ -228,11 +228,12 @@ def _print(rows: Sequence[UnseenRow]) -> None:
     for s in summary(rows):
         m = s.means
         assert m["lonely"] is not None
+        spreads = (s.psnr_spread, s.miou_spread) if s.seeds > 1 else (None, None)
         lines.append(
             (
                 s.scene, s.split, f"{s.recipe}, {s.results_version}", f"{s.seeds}", number(m["psnr"], 2),
-                number(s.psnr_spread, 2), number(m["worst"], 2), number(m["ssim"], 3), number(m["miou"], 3),
-                number(s.miou_spread, 3), number(m["miou_lerf_ovs"], 3), number(100 * m["lonely"], 1),
+                number(spreads[0], 2), number(m["worst"], 2), number(m["ssim"], 3), number(m["miou"], 3),
+                number(spreads[1], 3), number(m["miou_lerf_ovs"], 3), number(100 * m["lonely"], 1),
                 number(m["gaussians"], 0), number(m["cpu_seconds"], 0),
             )
         )  # fmt: skip

@@ -27,9 +27,16 @@ def draw_unseen(stem: Path, rows: "Sequence[UnseenRow]") -> None:
             for line, score in enumerate(("psnr", "miou")):
                 _draw_panel(panels[line][column], mine, recipes, score)
             panels[0][column].set_title(scene, fontsize=8)
+            # Photographs have no classes.
+            panels[1][column].set_visible(any(row.miou is not None for row in mine))
         panels[0][0].set_ylabel("PSNR of held-out views, dB\n(dash: worst view)")
         panels[1][0].set_ylabel("mIoU of held-out views")
-        panels[0][-1].legend(loc="best")
+        # One panel may lack a recipe that another has.
+        entries = {}
+        for panel in panels[0]:
+            handles, labels = panel.get_legend_handles_labels()
+            entries |= dict(zip(labels, handles, strict=True))
+        figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=6)
         write_figure(stem, figure)
 
 
@@ -39,7 +46,7 @@ def _draw_panel(
     recipes: Sequence[tuple[int, str]],
     score: str,
 ) -> None:
-    splits = list(dict.fromkeys(row.split for row in rows))
+    splits = sorted(dict.fromkeys(row.split for row in rows), key=_views)
     for i, (version, recipe) in enumerate(recipes):
         mine = [row for row in rows if (row.results_version, row.recipe) == (version, recipe)]
         shift = 0.5 * ((i + 0.5) / len(recipes) - 0.5)
@@ -53,3 +60,9 @@ def _draw_panel(
             panel.scatter(x, [row.worst for row in mine], s=40, marker="_", color=color)
     panel.set_xticks(range(len(splits)), splits)
     panel.set_xlim(-0.5, len(splits) - 0.5)
+
+
+def _views(split: str) -> int:
+    """Orders ``12 views`` before ``20 views``; ways of holding photographs out keep their order."""
+    number, _, unit = split.partition(" ")
+    return int(number) if unit == "views" else 0
