@@ -11,7 +11,8 @@ from vlgs.bench.__main__ import main
 from vlgs.bench.lonely import share_lonely, view_weights
 from vlgs.bench.presets import train_a_little
 from vlgs.bench.sheet import read_sheet
-from vlgs.bench.unseen import QUICK, UnseenRow, make_tasks, summary
+from vlgs.bench.unseen import QUICK, make_tasks, summary
+from vlgs.bench.unseen_row import UnseenRow
 
 
 def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -15,6 +15,7 @@ from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.quality import score
 from vlgs.bench.sheet import provenance, read_sheet, say, show, write_sheet
 from vlgs.bench.unseen_draw import draw_unseen
+from vlgs.bench.unseen_row import UnseenRow
 from vlgs.experiment import construct
 from vlgs.identity import RESULTS_VERSION
 from vlgs.report.provenance import commit
@@ -29,36 +30,6 @@ PHOTOGRAPHS = ("fox", "dtu_scan65", "camvid_0016E5")
 HELD_OUT = 8
 SIZE = ("data.width=120", "data.height=90")
 QUICK = ("data.width=48", "data.height=36", "data.points=400", "head.training.steps=30", "trainer=smoke")  # fmt: skip
-
-
-@dataclass(frozen=True)
-class UnseenRow:
-    """One line of unseen.csv: one training."""
-
-    scene: str
-    split: str
-    """``20 views``, or of photographs ``every 8th`` or ``a tenth``: what was held out."""
-    recipe: str
-    seed: int
-    run: str
-    """Its id: a row that has it is not trained again."""
-    results_version: int
-    commit: str | None
-    psnr: float
-    """dB, mean over the held-out views."""
-    worst: float
-    """dB, of the worst held-out view."""
-    worst_view: str
-    ssim: float
-    miou: float | None
-    """Headline: the argmax over the classes, where every pixel has one."""
-    miou_lerf_ovs: float | None
-    """Words against the whole picture, skies included."""
-    lonely: float
-    """Share of the held-out pixels that are covered by Gaussians that fewer than two training views see (`share_lonely`)."""
-    gaussians: int
-    cpu_seconds: float
-    """Of the training, over all threads."""
 
 
 @dataclass(frozen=True)

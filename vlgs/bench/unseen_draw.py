@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vlgs.bench.sheet import COLORS, STYLE, write_figure
+from vlgs.bench.unseen_row import UnseenRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from vlgs.bench.unseen import UnseenRow
 
-
-def draw_unseen(stem: Path, rows: "Sequence[UnseenRow]") -> None:
+def draw_unseen(stem: Path, rows: Sequence[UnseenRow]) -> None:
     """One column per scene, one panel per score; a dot per seed, a dash for its worst view, a colour per recipe."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -42,7 +41,7 @@ def draw_unseen(stem: Path, rows: "Sequence[UnseenRow]") -> None:
 
 def _draw_panel(
     panel: "Axes",
-    rows: "Sequence[UnseenRow]",
+    rows: Sequence[UnseenRow],
     recipes: Sequence[tuple[int, str]],
     score: str,
 ) -> None:
