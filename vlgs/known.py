@@ -59,7 +59,7 @@ def targets(name: str) -> frozenset[str]:
 
     Example:
         >>> sorted(targets("indicator"))[0]
-        'vlgs.indicator.Opacity'
+        'vlgs.indicator.Fixed'
     """
     return _schema().targets.get(name, frozenset())
 

@@ -53,7 +53,7 @@ from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 from vlgs.view_blend import FixedBlend, blend_targets
 from vlgs.view_blend.pose import slerp
 
-AREAS = ("ops", "fields", "losses", "objectives", "geometry", "blend", "fusion", "gaussians", "heads", "query", "indicator")  # fmt: skip
+AREAS = ("ops", "fields", "losses", "objectives", "geometry", "view_blend", "fusion", "gaussians", "heads", "query", "indicator")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {
