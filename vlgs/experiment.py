@@ -8,7 +8,9 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.initialize import get_gh_backup, restore_gh_from_backup
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
@@ -170,5 +172,10 @@ def _refusal(config: DictConfig, demand: Demand) -> str:
 
 def _options(group: str) -> dict[str, DictConfig]:
     """Every option of a group of ours, as it is by default."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return {name: compose("config", [f"{group}={name}"])[group] for name in options(group)}
+    running = get_gh_backup()  # Hydra's program around a run, beside which it allows no second one
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return {name: compose("config", [f"{group}={name}"])[group] for name in options(group)}
+    finally:
+        restore_gh_from_backup(running)

@@ -1,5 +1,7 @@
 """What options ask of each other is said by the options, and checked in one place for all commands."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,3 +69,15 @@ def test_what_says_nothing_has_no_property():
     asking = TwoModels()
     assert list(unmet({"sharing": asking, "fusion": object()})) == list(TwoModels.demands)
     assert not list(unmet({"fusion": object()}))
+
+
+def test_the_command_says_it_too(tmp_path: Path):
+    """Inside of Hydra's own program, which allows no second one."""
+    done = subprocess.run(
+        [sys.executable, "-m", "vlgs.run", "sharing=none", f"results={tmp_path}"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    said = "error: config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, got self"
+    assert done.stderr.strip() == said
