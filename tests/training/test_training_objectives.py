@@ -15,6 +15,7 @@ from vlgs.config import instantiate
 from vlgs.fields.cloud import point_cloud
 from vlgs.fields.splat import ViewRender
 from vlgs.gaussians import GaussiansConfig, attributes_of, read_ply, write_ply
+from vlgs.gaussians.parameters import complete
 from vlgs.gaussians.ply import parse_ply
 from vlgs.identity import run_id
 from vlgs.losses import l1_dssim, masked_cosine, masked_l1, masked_mse
@@ -153,6 +154,36 @@ def test_its_gradient_reaches_shapes_only_if_it_may(tiny_scene: Scene, shape_gra
     assert values is not None
     assert values.any()
     assert bool(means is not None and means.any()) == shape_grad
+
+
+def test_what_cannot_be_drawn_is_named(tiny_scene: Scene):
+    model = doubting(tiny_scene, "+gaussians.attributes.uncertainty.blended_by=null").model
+    for name in ("uncertainty", "means", "unheard"):
+        with pytest.raises(
+            ValueError, match=f"further attributes must be some of none, got {name}"
+        ):
+            model.render(tiny_scene.train[0].camera, further=[name])
+
+
+def test_without_colour_densification_goes_by_what_there_is(tiny_scene: Scene):
+    module = module_of(tiny_scene, "gaussians.densify_on=rgb")
+    objectives = module.step.setup.objectives
+    assert isinstance(objectives, dict)
+    del objectives["photometric"]
+    for step in range(2):  # codes start at zero, where language moves no position
+        module.training_step(step, 0)
+    assert any(gradient.any() for gradient in module.report.screen_gradients)
+
+
+def test_an_attribute_named_like_another_does_not_hide_it(tmp_path: Path):
+    config = GaussiansConfig(attributes={"lang_noise": {"width": 2}})
+    table = attributes_of(config, 3)
+    params = complete({row.name: torch.rand(4, *(row.shape or ())) for row in table.values()}, 3)
+    params |= {"lang_noise": torch.rand(4, 2)}
+    write_ply(tmp_path / "a.ply", params)
+    back = parse_ply(tmp_path / "a.ply", table)
+    assert back.keys() == params.keys()
+    assert all(torch.equal(back[name], params[name]) for name in params)
 
 
 def test_ids_count_what_stands_there():

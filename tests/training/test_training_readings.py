@@ -128,8 +128,11 @@ def test_pairs_of_neighbours(tiny_scene: Scene):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("gaussians.color=hsv", "color must be rgb_dc or rgb or evaluated, got hsv"),
-        ("gaussians.init_features=random", "init_features must be zero or lifted, got random"),
+        ("gaussians.color=hsv", "color must be one of rgb_dc, rgb, evaluated, got 'hsv'"),
+        (
+            "gaussians.init_features=random",
+            "init_features must be one of zero, lifted, got 'random'",
+        ),
         ("blend.kept=second", "kept must be one of first, nearer, got 'second'"),
         ("blend.pairs=near", "pairs must be one of uniform, neighbours, got 'near'"),
         ("blend.neighbours=0", "neighbours must be at least 1, got 0"),

@@ -9,6 +9,8 @@ import lightning as L  # noqa: N812 (its own abbreviation)
 
 from vlgs.bench.presets import Trained
 from vlgs.bench.quality import score
+from vlgs.training.after_step import AfterStep
+from vlgs.training.lightning import VLGSModule
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class CurvePoint:
     gaussians: int
 
 
-class Curve(L.Callback):
+class Curve(AfterStep):
     """Evaluates after chosen iterations. Must come last, so that what other callbacks do is counted."""
 
     def __init__(self, trained: Trained, label: str, at: frozenset[int]) -> None:
@@ -46,18 +48,10 @@ class Curve(L.Callback):
         """Start the clocks."""
         self.started = (time.perf_counter(), time.process_time())
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Stop the clocks, then evaluate if it is time."""
         self.wall += time.perf_counter() - self.started[0]
         self.cpu += time.process_time() - self.started[1]
-        module = self.trained.module
         if module.next_step not in self.at:
             return
         scores = score(self.trained)

@@ -167,12 +167,14 @@ class SplatModel(nn.Module):
         weight = fused.gaussians.opacities
         if row is None or name not in values or row.blended_by is None:
             drawn = [n for n in values if self.attributes[n].blended_by is not None]
-            raise ValueError(f"render: {name} must be one of {drawn}, got no such attribute")
+            raise ValueError(
+                f"render: further attributes must be some of {', '.join(drawn) or 'none'}, got {name}"
+            )
         if row.blended_by == "opacity_logits":
             return ChannelGroup(values[name], weight, row.shape_grad)
         if fused.language_weight.dim() == 2:
             raise ValueError(
-                f"render: {name} must be blended by the opacity with indicator=per_level"
+                f"render: {name} must be blended by the opacity with indicator=per_level, got the indicator"
             )
         return ChannelGroup(
             values[name], fused.language_weight, row.shape_grad, fused.gaussians.language_shape

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from vlgs.formats.plain import load_plain, save_plain
+from vlgs.gaussians.ply import SH_COEFFICIENTS
 
 _TENSORS = (
     ("xyz", "means", (None, 3)),
@@ -25,7 +26,6 @@ _TENSORS = (
 
 _LANGUAGE = 7
 """Place of LangSplat's language features."""
-_SH_COEFFICIENTS = (0, 3, 8, 15)
 
 
 def parse_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], int]:
@@ -54,7 +54,7 @@ def parse_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], int]:
     n = len(params["means"])
     if len(values) == 13:
         params["features"] = _take(who, "language_feature", values[_LANGUAGE], (None, None), n)
-    if params["shN"].shape[1] not in _SH_COEFFICIENTS:
+    if params["shN"].shape[1] not in SH_COEFFICIENTS:
         expected = "f_rest must have 0, 3, 8 or 15 coefficients"
         raise ValueError(f"{who}: {expected}, got {params['shN'].shape[1]}")
     params["sh0"] = params["sh0"][:, 0]
@@ -90,7 +90,7 @@ def write_checkpoint(
         for leaf, name in zip(trained, names, strict=True)
     ]
     statistics = (torch.zeros(n), torch.zeros(n, 1), torch.zeros(n, 1))
-    degree = _SH_COEFFICIENTS.index(coefficients)
+    degree = SH_COEFFICIENTS.index(coefficients)
     optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15).state_dict()
     save_plain(path, ((degree, *leaves, *statistics, optimizer, 1.0), iteration))
 

@@ -83,7 +83,8 @@ class AttributeConfig:
         require_range("attribute", 0, 1, rate=self.rate)
         require_range("attribute", -1e6, 1e6, start=self.start)
         require_choice("attribute", "activation", self.activation, ("none", "exp", "logistic"))
-        _require_choice("attribute", "blended_by", self.blended_by, ("opacity", "indicator", None))
+        if self.blended_by is not None:
+            require_choice("attribute", "blended_by", self.blended_by, ("opacity", "indicator"))
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ class GaussiansConfig:
             "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
         }.items():
-            _require_choice("gaussians", name, getattr(self, name), options)
+            require_choice("gaussians", name, getattr(self, name), options)
 
         further = {name: _attribute(name, extra) for name, extra in self.attributes.items()}
         object.__setattr__(self, "attributes", further)
@@ -172,11 +173,6 @@ def _attribute(name: str, extra: Any) -> AttributeConfig:
             f"gaussians: attributes.{name} must have a width and some of {', '.join(known[1:])}, got {got}"
         )
     return AttributeConfig(**{str(key): value for key, value in extra.items()})
-
-
-def _require_choice(who: str, name: str, value: object, choices: tuple[str | None, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{who}: {name} must be {' or '.join(map(str, choices))}, got {value}")
 
 
 def _require_at_least(who: str, least: int, **values: int) -> None:

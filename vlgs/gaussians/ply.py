@@ -180,5 +180,6 @@ def _columns_of(row: Attribute, present: Collection[str]) -> tuple[str, ...] | N
 
 
 def _numbered(present: Collection[str], stem: str) -> int:
-    """How many properties are called ``stem_...``."""
-    return sum(name.startswith(f"{stem}_") for name in present)
+    """How many properties are called ``stem_0``, ``stem_1`` ...; ``stem_noise_0`` is another attribute's."""
+    start = f"{stem}_"
+    return sum(n.startswith(start) and n.removeprefix(start).isdigit() for n in present)

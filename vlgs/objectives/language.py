@@ -41,11 +41,11 @@ class Language(Objective):
         self.predict = setup.predict
 
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
-        """Sum over the views that have language."""
+        """One for each view that has language."""
         terms: dict[str, Tensor] = {}
-        for place, render, target in zip(("1", "2"), step.renders, step.targets, strict=True):
+        for place, render, target in zip("12", step.renders, step.targets, strict=True):
             if render.feature is not None and target.codes is not None:
-                terms[place] = self.of(render.feature, target.codes, target.valid)
+                terms[f"language {place}"] = self.of(render.feature, target.codes, target.valid)
         return terms
 
     def of(

@@ -23,8 +23,8 @@ class Target:
     view: View
     image: Float[Tensor, "h w 3"]
     codes: Float[Tensor, "h wl t"] | None
-    """What pixels should show of language (`vlgs.heads.Head.targets`), mostly codes; with ``levels=joint`` those of the l mask levels of a pixel stand beside each other in its row, so that losses
-    and blending need not know of levels."""
+    """What pixels should show of language (`vlgs.heads.Head.targets`), mostly codes. With ``levels=joint`` those of the l mask levels of
+    a pixel stand beside each other in its row, so that losses and blending need not know of levels."""
     valid: Bool[Tensor, "h wl"] | None
     """Where there is a mask; None like `codes` where the view has no language."""
 

@@ -15,6 +15,7 @@ import lightning as L
 from vlgs.files import write_atomically
 from vlgs.gaussians import densify, reset_opacity
 from vlgs.runs import RunFolder, stop_signals
+from vlgs.training.after_step import AfterStep, own
 from vlgs.training.checkpoint import save_checkpoint
 from vlgs.training.curves import COLUMNS, csv_lines, read_rows
 from vlgs.training.lightning import VLGSModule
@@ -22,19 +23,11 @@ from vlgs.training.silence import silence
 from vlgs.training.state import capture
 
 
-class Densification(L.Callback):
+class Densification(AfterStep):
     """Clone, split, prune and reset, from the two real views of each iteration (conf/README.md, D.10 and D.11)."""
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Gather the screen gradients of this iteration, then change the Gaussians when it is time."""
-        module = _own(pl_module)
         densifying, done = module.densifying, module.next_step
         config = densifying.config
         if done >= config.densify.stop:
@@ -61,44 +54,29 @@ class Densification(L.Callback):
             reset_opacity(module.model.splats, module.optimizer, config)
 
 
-class Silence(L.Callback):
+class Silence(AfterStep):
     """After the last iteration, take the codes of what lies outside of masks (`vlgs.training.silence`)."""
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Do so when it is time."""
-        module = _own(pl_module)
         share, features = module.densifying.config.silent_above, module.model.splats["features"]
         done = module.next_step == module.settings.iterations
         if done and share < 1 and module.views.has_language and features.requires_grad:
             silence(module, share)
 
 
-class OwnFolder(L.Callback):
+class OwnFolder(AfterStep):
     """End a run whose folder was deleted or replaced, before anything more is written."""
 
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Check that the folder is still the same."""
         self.folder.require_own()
 
 
-class Checkpoints(L.Callback):
+class Checkpoints(AfterStep):
     """Save every so many iterations, at the end and before an early stop; no step twice."""
 
     def __init__(self, folder: Path, every: int, meta: dict[str, Any]) -> None:
@@ -109,24 +87,16 @@ class Checkpoints(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Note that the resumed step is saved already."""
-        self.saved = _own(pl_module).next_step
+        self.saved = own(pl_module).next_step
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Save when it is time."""
-        module = _own(pl_module)
         if self.every and module.next_step % self.every == 0:
             self._save(module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Save what was reached."""
-        self._save(_own(pl_module))
+        self._save(own(pl_module))
 
     def _save(self, module: VLGSModule) -> None:
         if module.next_step != self.saved:
@@ -134,7 +104,7 @@ class Checkpoints(L.Callback):
             self.saved = module.next_step
 
 
-class TrainingClock(L.Callback):
+class TrainingClock(AfterStep):
     """Seconds of training, summed over resumes; saving and evaluating are not part of it."""
 
     def on_train_batch_start(
@@ -143,19 +113,12 @@ class TrainingClock(L.Callback):
         """Start the clock of this iteration."""
         self.started = time.perf_counter()
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Add this iteration and its densification."""
-        _own(pl_module).train_seconds += time.perf_counter() - self.started
+        module.train_seconds += time.perf_counter() - self.started
 
 
-class CurveLog(L.Callback):
+class CurveLog(AfterStep):
     """Append loss, PSNR and the number of Gaussians to log.csv and to the chosen Lightning loggers."""
 
     def __init__(self, path: Path, every: int) -> None:
@@ -164,21 +127,13 @@ class CurveLog(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Keep the rows up to the resumed step; later ones will be written again."""
-        step, rows = _own(pl_module).next_step, []
+        step, rows = own(pl_module).next_step, []
         if self.path.is_file() and step > 0:
             rows = [row for row in read_rows(self.path) if int(row[0]) <= step]
         write_atomically(self.path, csv_lines([COLUMNS, *rows]).encode())
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Write a row when it is time."""
-        module = _own(pl_module)
         if module.next_step % self.every:
             return
         report = module.report
@@ -193,11 +148,11 @@ class CurveLog(L.Callback):
         with self.path.open("a", newline="") as file:
             deleted = file.tell() == 0  # by somebody, in mid-run: it goes on from here
             file.write(csv_lines([COLUMNS, cells] if deleted else [cells]))
-        for logger in trainer.loggers:
+        for logger in module.trainer.loggers:
             logger.log_metrics({k: float(v) for k, v in row.items()}, step=module.next_step)
 
 
-class ProgressLine(L.Callback):
+class ProgressLine(AfterStep):
     """A progress bar with loss, PSNR, number of Gaussians and time left; redrawn at most four times a second."""
 
     def __init__(self) -> None:
@@ -224,7 +179,7 @@ class ProgressLine(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Show the bar."""
-        module = _own(pl_module)
+        module = own(pl_module)
         self.task = self.bar.add_task(
             "",
             total=module.settings.iterations,
@@ -236,16 +191,8 @@ class ProgressLine(L.Callback):
         with suppress(OSError):
             self.bar.start()
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Redraw when a quarter of a second has passed."""
-        module = _own(pl_module)
         report = module.report
         self.mse = (
             report.color_mse if self.mse is None else 0.95 * self.mse + 0.05 * report.color_mse
@@ -336,8 +283,3 @@ def psnr_of(mse: float) -> float:
         20.0
     """
     return math.inf if mse == 0 else -10.0 * math.log10(mse)
-
-
-def _own(module: L.LightningModule) -> VLGSModule:
-    assert isinstance(module, VLGSModule)
-    return module

@@ -10,15 +10,13 @@ from torch import Tensor
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
+from vlgs.gaussians.ply import SH_COEFFICIENTS
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import FrozenRenders, freeze, has_frozen_shape
 from vlgs.training.exposure import Exposure
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
-
-HARMONICS = {0: 0, 3: 1, 8: 2, 15: 3}
-"""Coefficients above degree 0 -> degree."""
 
 
 @dataclass
@@ -147,7 +145,7 @@ class VLGSModule(L.LightningModule):
         for group in self.optimizer.param_groups:
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.densifying.extent
-        highest = HARMONICS[self.model.splats["shN"].shape[1]]
+        highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.densifying.config.init is not None or "shN" in self.settings.freeze
         self.model.sh_degree = highest if trained else min(highest, step // self.settings.sh_every)

@@ -54,6 +54,7 @@ class Forward:
     color: Float[Tensor, ""]
     """The part of it that comes from colour alone."""
     terms: Mapping[str, Float[Tensor, ""]]
+    """By the names that objectives give them."""
 
 
 @dataclass
@@ -109,7 +110,7 @@ class TrainingStep:
         if not all(mean2d.requires_grad for mean2d in screen):  # frozen, hence no densification
             forward.total.backward()
             return ()
-        if self.densify_on_color:
+        if self.densify_on_color and forward.color.requires_grad:
             color = torch.autograd.grad(forward.color, screen, retain_graph=True)
             forward.total.backward()
             return color

@@ -8,8 +8,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-import torch
-
 from vlgs.fields import Field
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
@@ -135,9 +133,6 @@ class Workshop:
             return build_module(scene, parts, self.seed, color)
         # Copies: training moves them in place, and other models may start from the same ones.
         splats = {name: value.detach().clone() for name, value in start.splats.items()}
-        width = parts.head.dim * scene.mask_levels
-        if splats["features"].shape[1] != width:
-            splats["features"] = torch.zeros(start.count, width)
         return build_module(scene, parts, self.seed, color, splats)
 
     def _remember(

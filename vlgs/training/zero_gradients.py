@@ -2,13 +2,12 @@
 
 import logging
 from collections.abc import Sequence
-from typing import Any
 
-import lightning as L
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vlgs.training.after_step import AfterStep
 from vlgs.training.lightning import VLGSModule
 from vlgs.types import Camera
 
@@ -44,7 +43,7 @@ def _inside(mean2d: Float[Tensor, "n 2"], camera: Camera) -> Bool[Tensor, " n"]:
     return ((mean2d > 0) & (mean2d < size)).all(dim=1)  # a culled one is at exactly 0
 
 
-class StuckAlarm(L.Callback):
+class StuckAlarm(AfterStep):
     """Warn once per weight when almost no Gaussian in view can change it any more.
 
     Attributes:
@@ -58,24 +57,16 @@ class StuckAlarm(L.Callback):
         self.alarmed: set[str] = set()
         self.in_a_row: dict[str, int] = {}
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def after_step(self, module: VLGSModule) -> None:
         """Look at the gradients of this iteration; runs before densification replaces the parameters."""
-        assert isinstance(pl_module, VLGSModule)
-        if pl_module.next_step % self.every:
+        if module.next_step % self.every:
             return
-        means2d = [render.mean2d for render in pl_module.report.renders]
-        views = pl_module.views.sampler.pair(pl_module.next_step - 1)
-        cameras = [pl_module.views.scene.train[index].camera for index in views]
-        weights = (r.name for r in pl_module.model.attributes.values() if r.role == "weight")
+        means2d = [render.mean2d for render in module.report.renders]
+        views = module.views.sampler.pair(module.next_step - 1)
+        cameras = [module.views.scene.train[index].camera for index in views]
+        weights = (r.name for r in module.model.attributes.values() if r.role == "weight")
         for name in weights:
-            gradient = pl_module.model.splats[name].grad
+            gradient = module.model.splats[name].grad
             if gradient is None:  # this weight takes no part, e.g. with indicator=opacity
                 continue
             share = self.shares[name] = stuck_share(gradient, means2d, cameras)
@@ -85,5 +76,5 @@ class StuckAlarm(L.Callback):
                 log.warning(
                     "train: %s of %.0f %% of the Gaussians in view have had no gradient at step %d and the %d looks before: "
                     "they are below raster.alpha_min, above raster.alpha_max or hidden, and will stay as they are",
-                    name, 100 * share, pl_module.next_step, LOOKS - 1,
+                    name, 100 * share, module.next_step, LOOKS - 1,
                 )  # fmt: skip

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from vlgs.values import require_range
+from vlgs.values import require_choice, require_range
 
 Convention = Literal["consistent", "paper"]
 
@@ -40,10 +40,10 @@ class ViewBlend(ABC):
 
     def __post_init__(self) -> None:
         who = type(self).__name__
-        _require_choice(who, "convention", self.convention, ("consistent", "paper"))
-        _require_choice(who, "mask", self.mask, ("and", "or"))
-        _require_choice(who, "kept", self.kept, ("first", "nearer"))
-        _require_choice(who, "pairs", self.pairs, ("uniform", "neighbours"))
+        require_choice(who, "convention", self.convention, ("consistent", "paper"))
+        require_choice(who, "mask", self.mask, ("and", "or"))
+        require_choice(who, "kept", self.kept, ("first", "nearer"))
+        require_choice(who, "pairs", self.pairs, ("uniform", "neighbours"))
         if self.neighbours < 1:
             raise ValueError(f"{who}: neighbours must be at least 1, got {self.neighbours}")
 
@@ -98,7 +98,7 @@ class GaussianBlend(ViewBlend):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_choice(
+        require_choice(
             "GaussianBlend", "out_of_range", self.out_of_range, ("clamp", "raw", "resample")
         )
         # With out_of_range=raw the camera leaves the world farther out.
@@ -144,8 +144,3 @@ class NoBlend(ViewBlend):
     def draw(self, rng: np.random.Generator) -> float:
         """Return 1: view 1 itself; the generator is left as it is."""
         return 1.0
-
-
-def _require_choice(who: str, name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{who}: {name} must be one of {', '.join(choices)}, got {value!r}")
