@@ -14,6 +14,7 @@ from vlgs.report.provenance import commit, machine
 from vlgs.report.results import write_metrics, write_queries
 from vlgs.report.timing import measure_fps
 from vlgs.report.words import questions_of
+from vlgs.training.separate import without_language
 from vlgs.training.stages import Progress
 from vlgs.training.workshop import Workshop, all_skips
 
@@ -34,6 +35,8 @@ def report(
     """
     experiment, scene, folder = ready.experiment, ready.scene, workshop.folder
     field, query = progress.field(), experiment.query
+    if not field.has_language:
+        scene, text = without_language(scene), None
     language = len(scene.mask_vectors) > 0
     folder.require_own()
     cameras = [view.camera for view in scene.train]

@@ -64,6 +64,8 @@ GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
+    "gaussians.codes": "none",
+    "gaussians.codes_shape_grad": True,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "stages": None,
     "trainer.exposure": False,

@@ -36,6 +36,7 @@ class Ball:
     """A red ball before a blue sky: all that is seen is a function of the direction in which one looks."""
 
     outputs = frozenset({"color"})
+    has_language = True
 
     def levels(self) -> Sequence[Field]:
         return (self,)

@@ -136,6 +136,7 @@ class FakeField:
     """Shows the drawing with noise of a given strength; 0 is the truth. Its features are embeddings, and it has Gaussians."""
 
     outputs = frozenset({"color", "feature"})
+    has_language = True
 
     def __init__(self, noise: float = 0.0) -> None:
         self.noise = noise

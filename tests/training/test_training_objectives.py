@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import jaxtyping
 import pytest
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 
 from vlgs.config import instantiate
 from vlgs.fields.cloud import point_cloud
-from vlgs.fields.splat import ViewRender
+from vlgs.fields.splat import FusedGaussians, ViewRender
 from vlgs.gaussians import GaussiansConfig, attributes_of, read_ply, write_ply
 from vlgs.gaussians.parameters import complete
 from vlgs.gaussians.ply import parse_ply
@@ -34,10 +35,11 @@ UNCERTAINTY = (
 
 def seen(scene: Scene, color: Tensor, image: Tensor, feature: Tensor, codes: Tensor) -> StepView:
     view = replace(scene.train[0], read_valid=None)
-    target = Target(view, image, codes, VALID)
+    target = Target(view, image, True, {"codes": codes, "valid": VALID}.__getitem__)
     nothing = torch.zeros(0)
     render = ViewRender(color, feature, None, None, nothing.bool(), nothing.reshape(0, 2))
-    return StepView(0, (0, 1), (target, target), (render, render), lambda: render)
+    fused = cast("FusedGaussians", None)  # what is tested looks at pixels alone
+    return StepView(0, (0, 1), (target, target), (render, render), fused, lambda: render)
 
 
 def test_terms_are_sums_over_both_views(tiny_scene: Scene):

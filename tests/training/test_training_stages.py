@@ -117,6 +117,7 @@ class Grey:
     """A trained scene without a single Gaussian."""
 
     outputs = frozenset({"color"})
+    has_language = True
 
     def levels(self) -> list[Field]:
         return [self]

@@ -35,6 +35,11 @@ class Field(Protocol):
         """Names of `FieldImages` that it can render."""
         ...
 
+    @property
+    def has_language(self) -> bool:
+        """Whether it can be asked for words; off: it was made to show colour alone."""
+        ...
+
     def levels(self) -> Sequence["Field"]:
         """A field for each mask level, finest first; a field of one level lists itself."""
         ...
@@ -108,6 +113,10 @@ class HasGaussians(Protocol):
 
 NO_GAUSSIANS = "the field has no Gaussians"
 """Why a figure that speaks of Gaussians is not available."""
+
+
+NO_LANGUAGE = "the field has no language: it was made to show colour alone"
+"""Why a figure that speaks of words is not available."""
 
 
 def gaussians_of(field: Field) -> Sequence[HasGaussians] | None:

@@ -31,6 +31,11 @@ class SeveralFields:
         first, *others = (field.outputs for field in self.fields)
         return first - {"feature"} if any("feature" not in other for other in others) else first
 
+    @property
+    def has_language(self) -> bool:
+        """See `Field`."""
+        return all(field.has_language for field in self.fields)
+
     def levels(self) -> Sequence[Field]:
         """See `Field`."""
         return [level for field in self.fields for level in field.levels()]

@@ -142,7 +142,8 @@ class SplatModel(nn.Module):
             values = self.view_color(fused, camera) if values is None else values
             groups.append(ChannelGroup(values, fused.gaussians.opacities))
         if language:
-            groups += _language_groups(feature, fused)
+            shape_grad = self.attributes["features"].shape_grad
+            groups += _language_groups(feature, fused, shape_grad)
         before = len(groups)
         groups += [self._group(name, fused) for name in further]
         out = self._rasterize(fused.gaussians, groups, camera)
@@ -225,10 +226,12 @@ class SplatModel(nn.Module):
         )
 
 
-def _language_groups(feature: Float[Tensor, "n d"], fused: FusedGaussians) -> list[ChannelGroup]:
+def _language_groups(
+    feature: Float[Tensor, "n d"], fused: FusedGaussians, shape_grad: bool
+) -> list[ChannelGroup]:
     """All codes in one group, or a group per mask level where each has an indicator of its own."""
     weight, shape = fused.language_weight, fused.gaussians.language_shape
     if weight.dim() == 1:
-        return [ChannelGroup(feature, weight, shape=shape)]
+        return [ChannelGroup(feature, weight, shape_grad, shape)]
     levels = zip(feature.chunk(weight.shape[1], dim=1), weight.unbind(dim=1), strict=True)
-    return [ChannelGroup(codes, own.contiguous(), shape=shape) for codes, own in levels]
+    return [ChannelGroup(codes, own.contiguous(), shape_grad, shape) for codes, own in levels]

@@ -22,22 +22,31 @@ class SplatField:
         model: The trained scene.
         color: Off: it was trained for language alone, and renders no colour.
         level: Place of the one mask level that is asked, from 0; None: all that the model has.
+        language: Off: it was trained for colour alone, and answers no word.
 
     Raises:
         ValueError: If the model has no such level.
     """
 
-    def __init__(self, model: SplatModel, color: bool = True, level: int | None = None) -> None:
+    def __init__(
+        self,
+        model: SplatModel,
+        color: bool = True,
+        level: int | None = None,
+        language: bool = True,
+    ) -> None:
         if level is not None and not 0 <= level < model.levels:
             raise ValueError(f"splat field: level must be below {model.levels}, got {level}")
         self.model = model
         self.color = color
         self.level = level
+        self.has_language = language
 
     @property
     def outputs(self) -> frozenset[str]:
         """See `Field`."""
-        return frozenset({"color", "alpha", "feature"} if self.color else {"feature"})
+        color = {"color", "alpha"} if self.color else set()
+        return frozenset(color | ({"feature"} if self.has_language else set()))
 
     def levels(self) -> Sequence[Field]:
         """See `Field`; all have the same Gaussians and colour."""

@@ -9,14 +9,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import torch
 from torch import Tensor
 
-from vlgs.gaussians.config import AttributeConfig, GaussiansConfig
+from vlgs.gaussians.config import Activation, AttributeConfig, GaussiansConfig
 from vlgs.gaussians.logistic import logistic, logit
 
 Role = Literal["position", "rotation", "scale", "weight", "value"]
 """What densification, freezing and rendering take an attribute for: a split shrinks scales, a rotation must not be zero, a weight has no
 gradient far beyond the cutoffs, a value is everything else."""
+
+
+SHORTEST = 1e-9
+"""Added to the length of a value of activation ``unit``, so that zero stays zero; LangSplat's."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class Attribute:
     columns: str | tuple[str, ...]
     """Its properties in a PLY file: the name of a number, the stem of ``stem_0``, ``stem_1`` ... of several, or all names."""
     role: Role = "value"
-    activation: Literal["none", "exp", "logistic"] = "none"
+    activation: Activation = "none"
     """From the raw parameter to natural units."""
     start: float | str = 0.0
     """Raw value where nothing else gives one, or the name of the attribute that it starts as a copy of."""
@@ -45,6 +50,8 @@ class Attribute:
         """Natural units."""
         if self.activation == "exp":
             return raw.exp()
+        if self.activation == "unit":
+            return raw / (torch.linalg.vector_norm(raw, dim=-1, keepdim=True) + SHORTEST)
         return logistic(raw) if self.activation == "logistic" else raw
 
     def column_names(self, width: int | None) -> tuple[str, ...]:
@@ -102,12 +109,14 @@ def attributes_of(
     shapes = {"shN": ((config.degree + 1) ** 2 - 1, 3), "features": (width,)}
     shapes["indicator_logits"] = () if levels is None else (levels,)
     starts = {"opacity_logits": config.init_opacity, "indicator_logits": config.init_indicator}
+    codes = {"activation": config.codes, "shape_grad": config.codes_shape_grad}
     table = {
         name: replace(
             row,
             shape=shapes.get(name, row.shape),
             start=logit(starts[name]) if name in starts else row.start,
             rate=_rate(row, rates or {}),
+            **(codes if name == "features" else {}),
         )
         for name, row in kept.items()
     }

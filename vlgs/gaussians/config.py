@@ -2,10 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from vlgs.demands import Demand
 from vlgs.values import require_choice, require_range
+
+Activation = Literal["none", "exp", "logistic", "unit"]
+"""From a raw parameter to natural units; ``unit`` is the direction of a vector."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class AttributeConfig:
 
     width: int
     """How many numbers a Gaussian has of it."""
-    activation: Literal["none", "exp", "logistic"] = "none"
+    activation: Activation = "none"
     """From the raw parameter to what is drawn."""
     start: float = 0.0
     """Raw value of all Gaussians at the start."""
@@ -82,7 +85,7 @@ class AttributeConfig:
         require_range("attribute", 1, 4096, width=self.width)
         require_range("attribute", 0, 1, rate=self.rate)
         require_range("attribute", -1e6, 1e6, start=self.start)
-        require_choice("attribute", "activation", self.activation, ("none", "exp", "logistic"))
+        require_choice("attribute", "activation", self.activation, get_args(Activation))
         if self.blended_by is not None:
             require_choice("attribute", "blended_by", self.blended_by, ("opacity", "indicator"))
 
@@ -120,6 +123,10 @@ class GaussiansConfig:
     """File of Gaussians to start from (`vlgs.formats.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (conf/README.md, D.11)."""
+    codes: Literal["none", "unit"] = "none"
+    """Activation of the language codes before they are blended: as they are, or at unit length, as LangSplat's."""
+    codes_shape_grad: bool = True
+    """Whether the gradient of language reaches positions, rotations and scales; Feature-3DGS's, as released, does not."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
     """Name -> what every Gaussian carries besides: an `AttributeConfig`, or a mapping of its values."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
@@ -143,6 +150,7 @@ class GaussiansConfig:
             "init_features": ("zero", "lifted"),
             "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
+            "codes": ("none", "unit"),
         }.items():
             require_choice("gaussians", name, getattr(self, name), options)
 

@@ -57,8 +57,7 @@ class BlendedView(Objective):
         if (
             pair[0] == pair[1]
             or not setup.blend.active
-            or first.codes is None
-            or second.codes is None
+            or not (first.has_language and second.has_language)
         ):
             return None
         similarity = setup.views.similarity(*pair) if setup.blend.ssim else 1.0
@@ -73,10 +72,6 @@ class BlendedView(Objective):
     def loss(self, plan: BlendPlan, step: StepView) -> Float[Tensor, ""]:
         """What the blended view adds to Eq. 12."""
         (first, second), counts = step.targets, self.setup.counts
-        assert first.codes is not None
-        assert first.valid is not None
-        assert second.codes is not None
-        assert second.valid is not None
         codes, valid = blend_targets(
             first.codes, first.valid, second.codes, second.valid, plan.k, self.setup.blend
         )

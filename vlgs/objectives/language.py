@@ -8,6 +8,7 @@ from torch import Tensor
 
 from vlgs.losses import masked_cosine, masked_l1, masked_mse
 from vlgs.objectives.objective import Objective, Setup, StepView
+from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.ops.squared_error import Pixels
 from vlgs.values import require_choice
 
@@ -35,17 +36,21 @@ class Language(Objective):
         self.error = error
         self.pixels: Pixels = pixels
         self.predict: Callable[[Tensor], Tensor] | None = None
+        self.views: TrainingViews | None = None
 
     def bind(self, setup: Setup) -> None:
         """What is compared is said by the head of the model."""
-        self.predict = setup.predict
+        self.predict = setup.model.predict
+        # Targets of a head that learns are embeddings: a map of them is large, and most systems that have one leave pixels out.
+        self.views = None if setup.model.head.learning_rate is None else setup.views
 
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """One for each view that has language."""
         terms: dict[str, Tensor] = {}
         for place, render, target in zip("12", step.renders, step.targets, strict=True):
-            if render.feature is not None and target.codes is not None:
-                terms[f"language {place}"] = self.of(render.feature, target.codes, target.valid)
+            if render.feature is not None and target.has_language:
+                error = self._of_masked if self.views is not None else self._of_map
+                terms[f"language {place}"] = error(render.feature, target)
         return terms
 
     def of(
@@ -57,3 +62,19 @@ class Language(Objective):
         """The error of one rendered map; with l mask levels a render has l d channels (`Target.codes`)."""
         shown = feature.view_as(codes) if self.predict is None else self.predict(feature)
         return _ERRORS[self.error](shown, codes, valid, self.pixels)
+
+    def _of_map(self, feature: Float[Tensor, "h w c"], target: Target) -> Float[Tensor, ""]:
+        return self.of(feature, target.codes, target.valid)
+
+    def _of_masked(self, feature: Float[Tensor, "h w c"], target: Target) -> Float[Tensor, ""]:
+        """The same of the pixels that have a mask alone; no map is made of the targets."""
+        assert self.predict is not None
+        assert self.views is not None
+        valid = target.valid
+        count = int(valid.sum())
+        if count == 0:
+            return feature.sum() * 0
+        codes = feature.view(*valid.shape, -1)[valid]  # [p, d]
+        wanted = self.views.codes_of(target.masks[valid])
+        error = _ERRORS[self.error](self.predict(codes[None]), wanted[None], None)
+        return error * (count / valid.numel()) if self.pixels == "all" else error

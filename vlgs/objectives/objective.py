@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.fields.splat import ViewRender
+from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.skip_count import SkipCount
 from vlgs.view_blend import ViewBlend
@@ -18,8 +18,8 @@ class Setup:
     """What objectives are told before the first iteration."""
 
     views: TrainingViews
-    predict: Callable[[Float[Tensor, "h w c"]], Float[Tensor, "h wl t"]]
-    """What a rendered map of codes shows, to be compared with `Target.codes` (`vlgs.heads.Head.predict`)."""
+    model: SplatModel
+    """What is trained, with its head. Parameters of Gaussians are other tensors after each densification: see `StepView.fused`."""
     objectives: Mapping[str, "Objective"]
     """All of the run, by name."""
     blend: ViewBlend
@@ -41,6 +41,8 @@ class StepView:
     """What they should look like."""
     renders: tuple[ViewRender, ViewRender]
     """What they look like, with the graph; what no objective needs is None."""
+    fused: FusedGaussians
+    """The Gaussians of this iteration, with the graph."""
     render: Callable[..., ViewRender]
     """Render the Gaussians of this iteration from another camera; arguments as those of `SplatModel.render`."""
     log: dict[str, float] = field(default_factory=dict)

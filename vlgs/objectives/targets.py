@@ -1,9 +1,12 @@
 """The training views as what they should look like: photographs, language codes, and how similar two views are."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vlgs.data.cache import PixelCache
@@ -16,17 +19,37 @@ TARGET_BYTES = 256 << 20
 """Most bytes of float32 images and code maps that are kept for the losses. If all views need more, those of one iteration are kept."""
 
 
+LanguageMap = Literal["masks", "codes", "valid"]
+
+
 @dataclass(frozen=True)
 class Target:
-    """What one training view should look like; its tensors are shared between iterations."""
+    """What one training view should look like; its tensors are shared between iterations.
+
+    With ``levels=joint`` the l mask levels of a pixel stand beside each other in its row, so that losses and blending need not know of
+    levels. Maps of language are there where `has_language` says so.
+    """
 
     view: View
     image: Float[Tensor, "h w 3"]
-    codes: Float[Tensor, "h wl t"] | None
-    """What pixels should show of language (`vlgs.heads.Head.targets`), mostly codes. With ``levels=joint`` those of the l mask levels of
-    a pixel stand beside each other in its row, so that losses and blending need not know of levels."""
-    valid: Bool[Tensor, "h wl"] | None
-    """Where there is a mask; None like `codes` where the view has no language."""
+    has_language: bool
+    read: Callable[[LanguageMap], Tensor]
+    """Makes a map of language when it is first asked for: one of codes can be large."""
+
+    @property
+    def masks(self) -> Int[Tensor, "h wl"]:
+        """Row of `vlgs.types.Scene.mask_vectors` per pixel, -1 where there is no mask."""
+        return self.read("masks")
+
+    @property
+    def codes(self) -> Float[Tensor, "h wl t"]:
+        """What pixels should show of language (`vlgs.heads.Head.targets`), mostly codes."""
+        return self.read("codes")
+
+    @property
+    def valid(self) -> Bool[Tensor, "h wl"]:
+        """Where there is a mask."""
+        return self.read("valid")
 
 
 class TrainingViews:
@@ -55,13 +78,23 @@ class TrainingViews:
         """A training view by its place in the scene."""
         view, kept = self.scene.train[index], self.cache
         image = kept.get((index, "image"), lambda: view.read_image().to(torch.float32).div_(255.0))
-        if view.read_masks is None or not self.has_language:
-            return Target(view, image, None, None)
-        read = view.read_masks
+        language = view.read_masks is not None and self.has_language
+        return Target(view, image, language, partial(self._map, index))
+
+    def codes_of(self, masks: Int[Tensor, "*b"]) -> Float[Tensor, "*b t"]:
+        """Targets of masks, by their rows; -1 gives zeros."""
+        return self._codes[masks.long()]
+
+    def _map(self, index: int, name: LanguageMap) -> Tensor:
+        read = self.scene.train[index].read_masks
+        assert read is not None  # whoever asks has looked
         # With l mask levels, each pixel becomes l neighbours in its row.
-        codes = kept.get((index, "codes"), lambda: self._codes[read().long()].flatten(1, -2))
-        valid = kept.get((index, "valid"), lambda: (read() >= 0).flatten(1))
-        return Target(view, image, codes, valid)
+        makers: Mapping[LanguageMap, Callable[[], Tensor]] = {
+            "masks": lambda: read().flatten(1),
+            "codes": lambda: self.codes_of(read()).flatten(1, -2),
+            "valid": lambda: (read() >= 0).flatten(1),
+        }
+        return self.cache.get((index, name), makers[name])
 
     def similarity(self, first: int, second: int) -> float:
         """SSIM(I1, I2), clamped at 0, computed once per pair (conf/README.md, D.12)."""

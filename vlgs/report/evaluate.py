@@ -6,7 +6,7 @@ from functools import partial
 
 import torch
 
-from vlgs.fields import NO_GAUSSIANS, Field, gaussians_of
+from vlgs.fields import NO_GAUSSIANS, NO_LANGUAGE, Field, gaussians_of
 from vlgs.metrics import image
 from vlgs.metrics.masks import QueryScore
 from vlgs.metrics.mean import mean_of_known
@@ -77,6 +77,8 @@ def evaluate(
     """
     headline = _resolve(protocol, scene)
     prompts, reason = prompts_of(scene, query, text)
+    if not field.has_language:
+        prompts, reason = None, NO_LANGUAGE
     gaussians, per_view = gaussians_of(field), {}
     tally = splats = None
     histogram = Histogram(scene.classes, scene.class_kinds)
@@ -96,10 +98,11 @@ def evaluate(
     else:
         language = LanguageScores(None, None, {}, {}, {"miou": reason, "loc_acc": reason}, {})
     asked = not isinstance(protocol, Auto) or (prompts is not None and _is_labelled(scene))
+    asked = asked and field.has_language
     evaluation = _conclude(scene, tag(headline, scene.split), per_view, language, asked)
-    if gaussians is None:
-        reasons = {**evaluation.reasons, "indicator": NO_GAUSSIANS}
-        return replace(evaluation, reasons=reasons)
+    if gaussians is None or not field.has_language:
+        why = NO_GAUSSIANS if gaussians is None else NO_LANGUAGE
+        return replace(evaluation, reasons={**evaluation.reasons, "indicator": why})
     return replace(evaluation, indicator=histogram.shares())
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from vlgs.data.sampler import PairSampler, nearest_views
+from vlgs.demands import has
 from vlgs.fields.splat import SplatModel
 from vlgs.formats import load_weights, start_from
 from vlgs.fusion import Fusion
@@ -45,6 +46,30 @@ class Parts:
     trainer: TrainerConfig
 
 
+def scaled(parts: Parts, share: float) -> Parts:
+    """The parts with a share of the iterations: what is said in iterations from the start shrinks or grows alike, intervals of densification stay."""
+    if share == 1:
+        return parts
+    trainer, densify = parts.trainer, parts.gaussians.densify
+
+    def of(steps: int, least: int = 1) -> int:
+        return max(least, round(steps * share))
+
+    trainer = replace(
+        trainer,
+        iterations=of(trainer.iterations),
+        sh_every=of(trainer.sh_every),
+        means_steps=None if trainer.means_steps is None else of(trainer.means_steps),
+    )
+    densify = replace(
+        densify,
+        start=of(densify.start, 0),
+        stop=of(densify.stop, 0),
+        reset_every=of(densify.reset_every) if densify.reset_every else 0,
+    )
+    return replace(parts, trainer=trainer, gaussians=replace(parts.gaussians, densify=densify))
+
+
 def build_module(
     scene: Scene,
     parts: Parts,
@@ -58,7 +83,7 @@ def build_module(
         scene: What is learned.
         parts: How.
         seed: Of all draws.
-        color: Off: language alone.
+        color: Off: language alone. A fusion that comes to trained Gaussians would change their colours, and still learns from both.
         start: Raw parameters to start from; None: those of ``gaussians.init``, or the scene's points.
 
     Raises:
@@ -100,6 +125,7 @@ def build_module(
         evaluated=config.color == "evaluated",
         attributes=attributes,
     )
+    color = color or (start is not None and not has(fusion, "untrained"))
     objectives = {n: o for n, o in parts.loss.items() if color or "color" not in o.needs}
     setup = bind(objectives, scene, model, parts.blend, parts.trainer.skip, seed)
     module = VLGSModule(model, setup, config, parts.trainer, seed)
@@ -126,9 +152,7 @@ def bind(
             codes = model.head.targets(scene.mask_vectors)
     counts = SkipCount()
     views = TrainingViews(scene, codes, sampler, counts)
-    setup = Setup(
-        views, model.predict, objectives, blend, skip.blend_weight, skip.blend_reuse, counts
-    )
+    setup = Setup(views, model, objectives, blend, skip.blend_weight, skip.blend_reuse, counts)
     for objective in objectives.values():
         objective.bind(setup)
     return setup

@@ -56,30 +56,35 @@ class FrozenRenders:
         self._colors: dict[int, Tensor] = {}
 
     def render(
-        self, index: int, camera: Camera, language: bool, fused: FusedGaussians
+        self, index: int, camera: Camera, color: bool, language: bool, fused: FusedGaussians
     ) -> ViewRender | None:
-        """A training view in colour, and in language if wanted; None where it must be rendered in full."""
-        opacities = fused.gaussians.opacities
-        if opacities.requires_grad or (language and fused.language_weight.requires_grad):
+        """A training view in colour, in language or in both; None where it must be rendered in full."""
+        opacities, weight = fused.gaussians.opacities, fused.language_weight
+        if (color and opacities.requires_grad) or (language and weight.requires_grad):
             return None
-        if language and fused.language_weight.dim() == 2:  # as many views as there are indicators
+        if language and weight.dim() == 2:  # as many views as there are indicators
             return None
         shape = Covariance(fused.gaussians.quats, fused.gaussians.scales)
         own = fused.gaussians.language_shape
-        by_color = self._view((index, "opacity"), camera, opacities, shape, fused)
-        by_language = by_color
-        if language and (fused.language_weight is not opacities or own is not None):
-            weight = fused.language_weight
-            by_language = self._view((index, "language"), camera, weight, own or shape, fused)
-        if by_color is None or by_language is None:
+        one = weight is opacities and own is None
+        by_color = by_language = None
+        if color or one:
+            by_color = self._view((index, "opacity"), camera, opacities, shape, fused)
+        if language:
+            by_language = by_color
+            if not one:
+                kept = (index, "language")
+                by_language = self._view(kept, camera, weight, own or shape, fused)
+        if (color and by_color is None) or (language and by_language is None):
             return None
+        seen = [view for view in (by_color, by_language) if view is not None]
         return ViewRender(
-            color=self._color(index, camera, by_color, fused),
-            feature=by_language.render(fused.feature) if language else None,
-            alpha_color=by_color.alpha,
-            alpha_language=by_language.alpha if language else None,
-            visible=by_color.visible | by_language.visible,
-            mean2d=by_color.mean2d,
+            color=self._color(index, camera, by_color, fused) if color and by_color else None,
+            feature=by_language.render(fused.feature) if by_language else None,
+            alpha_color=by_color.alpha if color and by_color else None,
+            alpha_language=by_language.alpha if by_language else None,
+            visible=seen[0].visible | seen[-1].visible,
+            mean2d=seen[0].mean2d,
         )
 
     def _view(

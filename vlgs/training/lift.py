@@ -20,7 +20,7 @@ def lift_features(module: VLGSModule) -> None:
     total = features.new_zeros(levels, len(features), features.shape[1] // levels + 1)
     for index in range(len(module.views.scene.train)):
         target = module.views[index]
-        if target.codes is None or target.valid is None:
+        if not target.has_language:
             continue
         seen = target.valid[..., None].to(features)
         image = torch.cat([target.codes * seen, seen], dim=-1)

@@ -72,7 +72,7 @@ class VLGSModule(L.LightningModule):
             camera_center(viewmats).float(),
         )
         color = any("color" in objective.needs for objective in setup.objectives.values())
-        keeps = settings.skip.frozen_weights and color and not model.evaluated
+        keeps = settings.skip.frozen_weights and not model.evaluated
         self.step = TrainingStep(
             model,
             setup,

@@ -43,11 +43,11 @@ def outside_masks(module: VLGSModule) -> Float[Tensor, "n levels"]:
     levels = [weight] * model.levels if weight.dim() == 1 else list(weight.T.contiguous())
     total = torch.zeros(len(weight), model.levels, 2)
     for index in range(0, len(views), -(-len(views) // MAX_VIEWS)):
-        valid, seen = module.views[index].valid, covered(views[index])
-        if valid is None:
+        target, seen = module.views[index], covered(views[index])
+        if not target.has_language:
             continue
         for level, own in enumerate(levels):
-            image = _outside_and_all(valid[:, level :: len(levels)], seen)
+            image = _outside_and_all(target.valid[:, level :: len(levels)], seen)
             total[:, level] += gathered(module, index, own, image)
     outside, everywhere = total.unbind(-1)
     return outside / everywhere.clamp_min(torch.finfo(total.dtype).tiny)

@@ -10,6 +10,7 @@ read back, one that is not goes on from its checkpoint: the same command continu
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Protocol, runtime_checkable
 
 from vlgs.demands import Demand
@@ -17,13 +18,17 @@ from vlgs.fields import Field
 from vlgs.fields.several import SeveralFields
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
-from vlgs.training.build import Parts
+from vlgs.training.build import Parts, scaled
 from vlgs.training.separate import without_language
-from vlgs.training.workshop import Workshop, unchanged
+from vlgs.training.workshop import Workshop
 from vlgs.types import Scene
+from vlgs.values import require_range
 
 _TAKEN = ("augment", "checkpoint", "renders")
 """Folders of a run that are no stage's of a method."""
+
+SHARES = (1e-4, 100)
+"""Least and most iterations of a stage, in those of ``trainer``."""
 
 Level = int | None
 """A mask level; None where a scene has no levels, or where something is of all levels."""
@@ -172,19 +177,27 @@ class Train:
     """The earlier stage whose Gaussians it starts from; None: those of ``gaussians``."""
     freeze: Sequence[str] = ()
     """Parameters that keep their values beside those of ``trainer.freeze``; with any of them nothing is densified."""
+    color: bool = True
+    """Off: language alone is trained, and the model still shows the colours that it starts with."""
+    share: float = 1.0
+    """Of the iterations of ``trainer``; schedules shrink with them (`vlgs.training.build.scaled`)."""
+
+    def __post_init__(self) -> None:
+        require_range("train", *SHARES, share=self.share)
 
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
-        """See `Stage`."""
+        """See `Stage`. Without masks, and without colour to train, the model stays as it starts."""
         models = {}
         for level, scene in progress.scenes.items():
             start = None if self.start is None else progress.gaussians(self.start, level)
             folder = progress.folder(level, self.name)
-            models[level] = workshop.train(folder, scene, self._change, start)
+            models[level] = workshop.train(folder, scene, self._change, start, self.color)
         return progress.having(self.name, models)
 
     def _change(self, parts: Parts) -> Parts:
+        parts = scaled(parts, self.share)
         if self.start is None and not self.freeze:
-            return unchanged(parts)
+            return parts
         trainer, gaussians = parts.trainer, parts.gaussians
         frozen = dict.fromkeys([*trainer.freeze, *self.freeze])
         # Harmonics that come trained are not taken away again: every degree is there after three iterations.
@@ -203,11 +216,18 @@ class TrainColor:
     """Of the sub-folder."""
     kept: bool = True
     """Off: it only prepares others, and is no part of the result."""
+    share: float = 1.0
+    """Of the iterations of ``trainer``; schedules shrink with them."""
+
+    def __post_init__(self) -> None:
+        require_range("train_color", *SHARES, share=self.share)
 
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
         """See `Stage`."""
         scene = without_language(next(iter(progress.scenes.values())))
-        model = workshop.train(self.name, scene, kept=self.kept)
+        change = partial(scaled, share=self.share)
+        trained = workshop.train(self.name, scene, change, kept=self.kept)
+        model = SplatField(trained.model, language=False)
         return progress.having(self.name, {None: model})
 
 

@@ -90,7 +90,7 @@ class TrainingStep:
             for index, target in zip(pair, targets, strict=True)
         )
         again = partial(self.model.render, fused=fused)
-        seen = StepView(step, pair, targets, (first, second), again)
+        seen = StepView(step, pair, targets, (first, second), fused, again)
         total, color = torch.zeros(()), torch.zeros(())
         terms: dict[str, Tensor] = {}
         for objective in self.setup.objectives.values():
@@ -123,10 +123,10 @@ class TrainingStep:
     def render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
         """A training view in all that is needed of it; a view without language in colour alone."""
         color, further = "color" in self.needs, tuple(sorted(self.needs - {"color", "feature"}))
-        language = ("feature" in self.needs and target.codes is not None) or not (color or further)
+        language = ("feature" in self.needs and target.has_language) or not (color or further)
         camera = target.view.camera
-        if self.frozen is not None and color and not further:
-            kept = self.frozen.render(index, camera, language, fused)
+        if self.frozen is not None and not further:
+            kept = self.frozen.render(index, camera, color, language, fused)
             if kept is not None:
                 return kept
         render = self.model.render(camera, color, language, fused, further)

@@ -91,7 +91,7 @@ class Workshop:
             scene: What it learns.
             change: What is different from the parts that the command line chose.
             start: Whose Gaussians it starts from; None: what the parts say.
-            color: Off: language alone.
+            color: Off: language alone; colours that it starts with stay as they are.
             kept: See `Made`.
 
         Raises:
@@ -106,7 +106,7 @@ class Workshop:
             which = f" of {name}" if name else ""
             where = f"step {module.next_step} of {module.settings.iterations}{which}"
             raise StoppedError(stopped_by, where)
-        return self._remember(name, module, color, kept)
+        return self._remember(name, module, color or start is not None, kept)
 
     def lift(self, name: str, scene: Scene, start: SplatModel) -> SplatField:
         """Lift the language of a scene onto finished Gaussians (`lift_features`); the folder is as that of a trained model.
