@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from vlgs import targets
 from vlgs.known import CONF as CONF
 from vlgs.known import FORMER, is_ours, join, last, nodes, renamed, unread
+from vlgs.manual import list_options
 from vlgs.text import visible
 from vlgs.values import require_range, require_types
 
@@ -26,6 +27,9 @@ OmegaConf.register_new_resolver(
     replace=True,
 )
 """``${code_channels:${levels},${head.dim}}``: language channels of a Gaussian, which is what a fusion is built for."""
+
+OmegaConf.register_new_resolver("list_options", list_options, replace=True)
+"""``${list_options:method}`` in the text of ``--help``."""
 
 MOST_THREADS = 256
 """Largest number of threads; no machine has more, and starting them would fail half-way."""

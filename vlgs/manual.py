@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 
-from vlgs.known import CONF, contents, place
+from vlgs.known import CONF, contents, options, place
 
 _KEY = re.compile(r"^(?P<indent> *)(?P<name>[\w$]+):(?P<value>(?: [^#]*)?)(?:# ?(?P<note>.*))?$")
 
@@ -18,9 +18,7 @@ def describe(group: str, option: str) -> str:
           fusion.feature_dim=${code_channels:${levels},${head.dim}}
           fusion.residual=true
     """
-    path = CONF / group / f"{option}.yaml"
-    lines = path.read_text().splitlines()
-    about = [line[2:] for line in lines if line.startswith("# ") and "@package" not in line]
+    about = _about(group, option)
     keys = dict(_keys(group, option))
     width = min(44, max((len(f"{key}={value}") for key, (value, _) in keys.items()), default=0))
     rows = []
@@ -28,6 +26,19 @@ def describe(group: str, option: str) -> str:
         pair = f"{key}={value}"
         rows.append(f"  {pair:<{width}}  {note}".rstrip())
     return "\n".join([f"{group}={option}", *(f"  {line}" for line in about), *rows])
+
+
+def list_options(group: str) -> str:
+    """A line for each option of a group, its name and how its file begins, as they stand in the text of ``--help``."""
+    known = {name: _about(group, name)[0] for name in options(group)}
+    width = max(map(len, known))
+    return "\n    ".join(f"{name:<{width}}  {line}" for name, line in known.items())
+
+
+def _about(group: str, option: str) -> list[str]:
+    """Comments of an option's file that stand on lines of their own."""
+    lines = (CONF / group / f"{option}.yaml").read_text().splitlines()
+    return [line[2:] for line in lines if line.startswith("# ") and "@package" not in line]
 
 
 def _keys(group: str, option: str) -> Iterator[tuple[str, tuple[str, str]]]:

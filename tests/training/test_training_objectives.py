@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import jaxtyping
 import pytest
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from vlgs.config import instantiate
 from vlgs.fields.cloud import point_cloud
 from vlgs.fields.splat import FusedGaussians, ViewRender
-from vlgs.gaussians import GaussiansConfig, attributes_of, read_ply, write_ply
+from vlgs.gaussians import GaussiansConfig, activate, attributes_of, conform, read_ply, write_ply
 from vlgs.gaussians.parameters import complete
 from vlgs.gaussians.ply import parse_ply
 from vlgs.identity import run_id
@@ -26,6 +25,9 @@ from vlgs.training.state import capture
 from vlgs.types import Scene
 
 VALID = torch.tensor([[True, False], [True, True]])
+EMPTY = conform({"means": torch.zeros(0, 3)}, attributes_of(GaussiansConfig(), 3))
+NONE = FusedGaussians(activate(EMPTY), torch.zeros(0, 3), EMPTY["features"], torch.zeros(0))
+"""What is tested with it looks at pixels alone."""
 UNCERTAINTY = (
     "+gaussians.attributes.uncertainty.width=1",
     "+gaussians.attributes.uncertainty.activation=logistic",
@@ -38,8 +40,7 @@ def seen(scene: Scene, color: Tensor, image: Tensor, feature: Tensor, codes: Ten
     target = Target(view, image, True, {"codes": codes, "valid": VALID}.__getitem__)
     nothing = torch.zeros(0)
     render = ViewRender(color, feature, None, None, nothing.bool(), nothing.reshape(0, 2))
-    fused = cast("FusedGaussians", None)  # what is tested looks at pixels alone
-    return StepView(0, (0, 1), (target, target), (render, render), fused, lambda: render)
+    return StepView(0, (0, 1), (target, target), (render, render), NONE, lambda: render)
 
 
 def test_terms_are_sums_over_both_views(tiny_scene: Scene):
