@@ -20,8 +20,10 @@ Role = Literal["position", "rotation", "scale", "weight", "value"]
 gradient far beyond the cutoffs, a value is everything else."""
 
 
-SHORTEST = 1e-9
-"""Added to the length of a value of activation ``unit``, so that zero stays zero; LangSplat's."""
+SHORTEST = 1e-3
+"""Added to the length of a value of activation ``unit``, so that zero stays zero. With LangSplat's 1e-9 the gradient at zero, where codes start, is
+millions of times those that follow, and Adam's second moment has to forget it: that takes the 30 000 iterations which LangSplat has, and
+in 400 nothing more is learned (mIoU of the benchmark 23 instead of 55 %)."""
 
 
 @dataclass(frozen=True)
