@@ -51,7 +51,7 @@ def report(
     if asked and asked.note:
         query = asked.query
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
-    if len(progress.scenes) > 1:
+    if len(progress.scenes) > 1 and field.has_language:
         first, *_, last = progress.scenes
         whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})

@@ -94,6 +94,8 @@ def test_a_method_runs(chosen, tmp_path: Path):
     [
         (["method=features", "sharing=none"], "sharing must be pos or pos_cov with stages of a method, as .*, got none"),
         (["method=lift", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
+        (["method=gs3d", "fusion=self"], "fusion must be none with a method of colour alone, as there is no language, got self"),
+        (["method=gs3d", "indicator=learned"], "indicator must be fixed or opacity with a method of colour alone"),
         (["stages=[3]"], "config: stages must be a list of stages, got"),
         (["stages=[{_target_: vlgs.training.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
         (["stages=[{_target_: vlgs.training.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),

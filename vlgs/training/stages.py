@@ -133,6 +133,7 @@ class Method:
     def demands(self) -> Sequence[Demand]:
         """Those of its stages, and that nothing else says how models are made."""
         asked = [demand for stage in self.listed for demand in getattr(stage, "demands", ())]
+        asked += getattr(self.listed[-1], "demands_at_end", ())
         why = "as the stages say how models are made"
         return [Demand("stages of a method", "sharing", "replaceable", why), *asked]
 
@@ -212,6 +213,11 @@ class Train:
 class TrainColor:
     """Trains Gaussians on colour alone: one model, whatever the mask levels."""
 
+    demands_at_end: ClassVar[Sequence[Demand]] = tuple(
+        Demand("a method of colour alone", group, "untrained", "as there is no language")
+        for group in ("fusion", "indicator")
+    )
+    """What it asks where nothing comes after it."""
     name: str
     """Of the sub-folder."""
     kept: bool = True
