@@ -22,8 +22,8 @@ from vlgs.bench.scenes import (
 from vlgs.bench.sheet import read_sheet
 from vlgs.bench.switches import check_switch, raster_switches
 from vlgs.bench.workload import Workload, make_workload
-from vlgs.ops.blend import count_work
 from vlgs.ops.project import project
+from vlgs.ops.rasterize_to_pixels import count_work
 from vlgs.types import RasterConfig
 
 

@@ -15,7 +15,7 @@ from vlgs.bench.sheet import read_sheet
 from vlgs.bench.steps import measure_switches
 from vlgs.bench.train import QUICK
 from vlgs.bench.workload import make_workload
-from vlgs.ops.cached_weights import FrozenView
+from vlgs.ops.cached_weights import CachedView
 from vlgs.skips import SKIPS
 from vlgs.training.state import capture
 from vlgs.types import Camera
@@ -62,8 +62,8 @@ def test_every_switch_of_training_has_a_row_and_keeps_its_promise(trained: Train
 def test_a_skip_that_moves_numbers_breaks_its_promise(
     trained: Trained, monkeypatch: pytest.MonkeyPatch
 ):
-    product = FrozenView.render
-    monkeypatch.setattr(FrozenView, "render", lambda self, v: 0.9999 * product(self, v))
+    product = CachedView.render
+    monkeypatch.setattr(CachedView, "render", lambda self, v: 0.9999 * product(self, v))
     broken = violated(measure_switches("q", trained.module, 1, 1, draws=20)[1])
     assert [c.promise.partition(":")[0] for c in broken] == ["frozen_weights"]
 

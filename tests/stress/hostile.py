@@ -21,7 +21,7 @@ from tests.stress.splats import (
     tensors_of,
 )
 from vlgs.ops import project
-from vlgs.ops.blend import blend
+from vlgs.ops.rasterize_to_pixels import rasterize_to_pixels
 from vlgs.types import Camera, ChannelGroup, RasterConfig
 
 
@@ -252,7 +252,7 @@ def tight_bounds(full: bool) -> Verdict:
         camera = Camera(torch.eye(4), K, splats.width, splats.height)
         flat = project.project(splats.means, splats.quats, splats.scales, camera, config)
         group = ChannelGroup(torch.eye(batch, dtype=dtype), splats.weights[0])
-        drawn = blend(flat, [group], camera, config).images[0] > 0
+        drawn = rasterize_to_pixels(flat, [group], camera, config).images[0] > 0
         octaves, slack = _exponents(flat, splats.width, splats.height, torch.finfo(dtype).eps)
         limit = torch.log(splats.weights[0].double() / config.alpha_min)
         inside, outside = octaves < limit - slack, octaves > limit + slack

@@ -16,7 +16,7 @@ from vlgs.bench.clock import replaced
 from vlgs.bench.presets import build, composed
 from vlgs.experiment import construct
 from vlgs.objectives import BlendedView
-from vlgs.ops import attention, blend, project, view_color
+from vlgs.ops import attention, project, rasterize_to_pixels, view_color
 from vlgs.training.lightning import VLGSModule
 
 KERNELS = ("project", "blend", "fusion", "Adam")
@@ -105,7 +105,7 @@ def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
     """What is timed, and as which part."""
     functions = {
         "project": project._Project,
-        "blend": blend._Blend,
+        "blend": rasterize_to_pixels._RasterizeToPixels,
         "fusion": attention._Attention,
         "spherical harmonics": view_color._ViewColor,
     }
