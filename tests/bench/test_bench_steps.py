@@ -11,7 +11,7 @@ from vlgs.bench import error, steps
 from vlgs.bench.checks import Check, violated
 from vlgs.bench.one_step import StepSwitch, measure_step, run_step, step_switches, turned
 from vlgs.bench.presets import Trained, train_a_little
-from vlgs.bench.sheet import read_sheet
+from vlgs.bench.record import read_record
 from vlgs.bench.steps import measure_switches
 from vlgs.bench.train import QUICK
 from vlgs.bench.workload import make_workload
@@ -123,10 +123,10 @@ def test_rows_go_into_a_file_of_their_own(
     monkeypatch.setattr(error, "_print", lambda _: None)
     scene = {"tiny": make_workload(60, 16, 16)}
     assert error.run_error(scene, None, [1], 1, tmp_path, 0, trained) == []
-    table = read_sheet(tmp_path / "error_steps.csv")
+    table = read_record(tmp_path / "error_steps.csv")
     assert set(table) >= {
         "scene", "switch", "on_forward_ms", "off_backward_cpu", "skipped", "loss_error", "loss_bound",
         "image_max", "l2_splats.features", "cos_fusion.qkv.weight",
     }  # fmt: skip
-    promises = read_sheet(tmp_path / "error_checks.csv").promise
+    promises = read_record(tmp_path / "error_checks.csv").promise
     assert "blend_reuse: on against off, camera" in list(promises)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_scenes import Splats, random_splats, relative_error, render
+from render_scenes import RenderScene, random_splats, relative_error, render
 from torch import Tensor
 
 from vlgs.fields.cached_weights import CachedViews
@@ -12,7 +12,7 @@ from vlgs.ops.cached_weights import CacheBudgetError, CachedView
 from vlgs.types import Camera, RasterConfig
 
 
-def freeze(splats: Splats, config: RasterConfig | None = None, **more: int) -> CachedView:
+def freeze(splats: RenderScene, config: RasterConfig | None = None, **more: int) -> CachedView:
     camera = Camera(splats.viewmat, splats.K, splats.width, splats.height)
     geometry = splats.means, splats.quats, splats.scales, splats.weights[0]
     return CachedView(*geometry, camera, config or RasterConfig(), **more)

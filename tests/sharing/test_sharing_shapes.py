@@ -231,7 +231,7 @@ def test_kept_weights_are_those_of_both_shapes(tiny_scene: Scene, frozen: bool):
     fused, target = module.model.fuse(), module.views[0]
     kept = module.step.render(0, target, fused)
     plain = module.model.render(target.view.camera, fused=fused)
-    assert (module.step.cached is not None) == frozen
+    assert (module.step.frozen is not None) == frozen
     assert kept.feature is not None
     assert plain.feature is not None
     torch.testing.assert_close(kept.feature, plain.feature, rtol=0, atol=1e-5)

@@ -389,7 +389,7 @@ def public_functions(package: str) -> set[str]:
                 returns = str(getattr(function, "__annotations__", {}).get("return", ""))
                 if inspect.isfunction(function) and any(
                     kind in returns
-                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "Splats")
+                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "StressScene")
                 ):
                     found.add(f"{module}.{name}.{member}".rstrip("."))
     return found

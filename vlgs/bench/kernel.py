@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vlgs.bench.child import Child, free_memory
 from vlgs.bench.clock import Pass, Spread, spreads, take_turns, time_pass
-from vlgs.bench.sheet import provenance, say, show, write_sheet
+from vlgs.bench.record import provenance, say, show, write_record
 from vlgs.bench.workload import Workload, make_workload
 from vlgs.ops.machine import instruction_sets, peak_fma
 from vlgs.ops.project import Splats, project
@@ -146,7 +146,7 @@ def run_kernel(
         for size in dense_sizes:
             parts = ("call", "reference")
             rows += _measure(children, size, 3, threads, parts, max(3, repeats // 3), seed, rate)
-    write_sheet(out / "kernel.csv", rows, header)
+    write_record(out / "kernel.csv", rows, header)
     _print(rows)
     return rows
 

@@ -163,7 +163,7 @@ class _Pair:
         return Check(scene, f"{promise}, camera", self.detour, skip.on + 1e-5)
 
     def _kept_mib(self) -> float | None:
-        return None if self.on.step.cached is None else self.on.step.cached.views.used / MIB
+        return None if self.on.step.frozen is None else self.on.step.frozen.views.used / MIB
 
     def _bound(self, off: Step) -> float | None:
         """How far the loss may move."""

@@ -66,14 +66,14 @@ class TrainingStep:
         setup: What it learns from, and the terms of the loss, which are bound to it.
         densify_on_color: Whether densification goes by the gradients of colour's objectives alone.
         exposure: A map of colour per photograph, or None.
-        cached: Renders from kept weights where shapes and weights are frozen, or None.
+        frozen: Renders from kept weights where shapes and weights are frozen, or None.
     """
 
     model: SplatModel
     setup: Setup
     densify_on_color: bool
     exposure: Exposure | None
-    cached: CachedRenders | None
+    frozen: CachedRenders | None
 
     @cached_property
     def needs(self) -> frozenset[str]:
@@ -125,8 +125,8 @@ class TrainingStep:
         color, further = "color" in self.needs, tuple(sorted(self.needs - {"color", "feature"}))
         language = ("feature" in self.needs and target.codes is not None) or not (color or further)
         camera = target.view.camera
-        if self.cached is not None and color and not further:
-            kept = self.cached.render(index, camera, language, fused)
+        if self.frozen is not None and color and not further:
+            kept = self.frozen.render(index, camera, language, fused)
             if kept is not None:
                 return kept
         render = self.model.render(camera, color, language, fused, further)
