@@ -82,7 +82,7 @@ def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
     watch = Stopwatch()
     rows: list[dict[str, float]] = []
     with ExitStack() as patches:
-        module = _module(size)
+        module = make_module(size)
         for index in range(size.views):
             module.views[index]  # as after the first epoch
         for owner, name, part in _timed(module):
@@ -161,7 +161,8 @@ def show_iterations(measured: list[tuple[IterationSize, dict[str, float]]]) -> T
     return table
 
 
-def _module(size: IterationSize) -> VLGSModule:
+def make_module(size: IterationSize) -> VLGSModule:
+    """What a run of this size trains, at its start."""
     overrides = [
         *OVERRIDES,
         f"data.train_views={size.views}",
