@@ -4,7 +4,7 @@
 
 #include <algorithm>
 
-#include "buffer.h"
+#include "buffer_pool.h"
 #include "kernels.h"
 #include "threads.h"
 

@@ -7,12 +7,12 @@ namespace vlgs {
 namespace {
 
 // At least so many 16-lane multiply-adds of floats in this thread, for who takes the time; returns how many.
-int64_t multiply_adds(int64_t packs) {
+int64_t peak_fma(int64_t packs) {
   nb::gil_scoped_release unlocked;
-  const int64_t rounds = packs / kYardstick + 1;
-  volatile float kept = kernels<float>().multiply_add(rounds, 0.5f, 1.0f);
+  const int64_t rounds = packs / kPeakFmaPacks + 1;
+  volatile float kept = kernels<float>().peak_fma(rounds, 0.5f, 1.0f);
   (void)kept;
-  return rounds * kYardstick;
+  return rounds * kPeakFmaPacks;
 }
 
 }  // namespace
@@ -26,12 +26,12 @@ NB_MODULE(_csrc, m) {
   isa();  // a wish that cannot be met ends the import; later it would be thrown inside a parallel loop
   m.def("isa", &isa);
   m.def("isas", &isas);
-  m.def("multiply_adds", &multiply_adds, "packs"_a);
+  m.def("peak_fma", &peak_fma, "packs"_a);
   bind_project(m);
-  bind_blend(m);
+  bind_rasterize(m);
   bind_attention(m);
   bind_view_color(m);
   bind_ssim(m);
   bind_squared_error(m);
-  bind_frozen(m);
+  bind_cached_weights(m);
 }

@@ -27,11 +27,11 @@ inline nb::arg strict(const char *name) {
 
 // One file each, in float and double.
 void bind_project(nb::module_ &m);
-void bind_blend(nb::module_ &m);
+void bind_rasterize(nb::module_ &m);
 void bind_attention(nb::module_ &m);
 void bind_view_color(nb::module_ &m);
 void bind_ssim(nb::module_ &m);
 void bind_squared_error(nb::module_ &m);
-void bind_frozen(nb::module_ &m);
+void bind_cached_weights(nb::module_ &m);
 
 }  // namespace vlgs

@@ -15,18 +15,18 @@
 
 namespace vlgs {
 
-constexpr int kTile = 16;          // pixels on a side of a tile
-constexpr int kBlock = 4;          // pixels on a side of a block
-constexpr int kBlocks = 16;        // blocks of a tile, and bits of a block mask: row by row
-constexpr int kPixels = 16;        // pixels of a block, row by row
-constexpr int kRecord = 16;        // numbers kept for one visible Gaussian
-constexpr int kMaxChains = 2;      // transmittances carried in one pass over the tiles
-constexpr int kNarrowParts = 2;    // parts of 3 channels for which a record has room
-constexpr int kYardstick = 10;     // packs of multiply-adds in a round of the yardstick
-constexpr int kFrozenAhead = 16;   // entries between asking for a kept weight and using it
-constexpr int kGatherAhead = 16;   // entries between asking for a record and copying it
-constexpr int kListSlack = 16;     // entries that a block's list may be written beyond its end
-constexpr int kWeightsAhead = 64;  // blending weights formed before any wide channels are summed
+constexpr int kTile = 16;                // pixels on a side of a tile
+constexpr int kBlock = 4;                // pixels on a side of a block
+constexpr int kBlocks = 16;              // blocks of a tile, and bits of a block mask: row by row
+constexpr int kPixels = 16;              // pixels of a block, row by row
+constexpr int kRecord = 16;              // numbers kept for one visible Gaussian
+constexpr int kMaxChains = 2;            // transmittances carried in one pass over the tiles
+constexpr int kNarrowParts = 2;          // parts of 3 channels for which a record has room
+constexpr int kPeakFmaPacks = 10;        // packs of multiply-adds in a round of peak_fma
+constexpr int kCachedWeightsAhead = 16;  // entries between asking for a kept weight and using it
+constexpr int kGatherAhead = 16;         // entries between asking for a record and copying it
+constexpr int kListSlack = 16;           // entries that a block's list may be written beyond its end
+constexpr int kWeightsAhead = 64;        // blending weights formed before any wide channels are summed
 
 // Exponents are in octaves: weight falls off as 2^-(u^2 + v^2) with u, v scaled by kOctaves = sqrt(log2(e) /
 // 2).
@@ -168,19 +168,17 @@ constexpr int kSlotHead = 8;  // where wide channels begin
 //
 // project, project_backward: rows [begin, end).
 // boxes: the tiles in which the pixel centres of `count` ellipses in a row may lie; empty, x0 >= x1, also
-// where
-//   the cutoff is negative. Inverse deviations are brought to octaves by a factor.
-// cover: block masks of one Gaussian over the tiles of a box, row by row.
-// blend, blend_backward: one tile; with scratch as large as its *_scratch says. Backward writes one slot per
-//   entry of the tile's list and says whether all it read was finite.
-// freeze: weights of the first chain of one tile: entries per block, and if `ids` is given the entries
-// themselves. frozen_blend: one block of pixels of an image; scratch [channels, kPixels]. frozen_upstream,
-// frozen_backward: a block of pixels as [channels, kPixels], then the gradient of one Gaussian's
-//   values over its entries.
+//   where the cutoff is negative. Inverse deviations are brought to octaves by a factor.
+// tile_intersect: block masks of one Gaussian over the tiles of a box, row by row.
+// rasterize_forward, rasterize_backward: one tile; with scratch as large as its *_scratch says. Backward
+//   writes one slot per entry of the tile's list and says whether all it read was finite.
+// cache_weights: weights of the first chain of one tile: entries per block, and if `ids` is given the entries
+//   themselves. cached_weights_render: one block of pixels of an image; scratch [channels, kPixels].
+//   cached_weights_upstream, cached_weights_backward: a block of pixels as [channels, kPixels], then the
+//   gradient of one Gaussian's values over its entries.
 // attention, attention_backward: Gaussians [begin, end); backward adds to sums over them, one per lane.
-// multiply_add: a yardstick: `rounds` times kYardstick multiply-adds of 16 lanes, none of which waits for
-// another
-//   of its round.
+// peak_fma: the fastest that this machine computes: `rounds` times kPeakFmaPacks multiply-adds of 16 lanes,
+//   none of which waits for another of its round.
 // ssim_*: rows [begin, end), all channels; with scratch as large as the *_scratch of its direction says.
 // squared_error_*: pixels [begin, end), few enough for sums in T.
 // clang-format off
@@ -188,22 +186,23 @@ constexpr int kSlotHead = 8;  // where wide channels begin
   KERNEL(void, project, const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end)                     \
   KERNEL(void, project_backward, const Camera &, Gaussians<T>, GaussianGrads<T>, int64_t begin, int64_t end)     \
   KERNEL(void, boxes, Grid, int64_t count, const T *mean2d, const T *ellipse, T octaves, const T *cutoffs, Box *) \
-  KERNEL(void, cover, Grid, const T *record, T cutoff, Box, uint16_t *masks)                                     \
-  KERNEL(int64_t, blend_scratch, const Pass<T> &, int64_t list_length)                                           \
-  KERNEL(int64_t, backward_scratch, const Pass<T> &, int64_t list_length)                                        \
-  KERNEL(void, blend, const Pass<T> &, int64_t tile, T *scratch, uint32_t *list)                                 \
-  KERNEL(bool, blend_backward, const Pass<T> &, int64_t tile, T *scratch, T *slots)                              \
-  KERNEL(void, freeze, const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights)                \
-  KERNEL(void, frozen_blend, const Grid &, int64_t block, int64_t count, const uint32_t *ids, const T *weights,  \
-         const T *values, int64_t channels, T *scratch, T *image)                                                \
-  KERNEL(void, frozen_upstream, const Grid &, int64_t block, const T *d_image, int64_t channels, T *packs)       \
-  KERNEL(void, frozen_backward, int64_t count, const uint32_t *entries, const uint32_t *blocks,                  \
+  KERNEL(void, tile_intersect, Grid, const T *record, T cutoff, Box, uint16_t *masks)                            \
+  KERNEL(int64_t, rasterize_forward_scratch, const Pass<T> &, int64_t list_length)                               \
+  KERNEL(int64_t, rasterize_backward_scratch, const Pass<T> &, int64_t list_length)                              \
+  KERNEL(void, rasterize_forward, const Pass<T> &, int64_t tile, T *scratch, uint32_t *list)                     \
+  KERNEL(bool, rasterize_backward, const Pass<T> &, int64_t tile, T *scratch, T *slots)                          \
+  KERNEL(void, cache_weights, const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights)         \
+  KERNEL(void, cached_weights_render, const Grid &, int64_t block, int64_t count, const uint32_t *ids,           \
+         const T *weights, const T *values, int64_t channels, T *scratch, T *image)                              \
+  KERNEL(void, cached_weights_upstream, const Grid &, int64_t block, const T *d_image, int64_t channels,         \
+         T *packs)                                                                                               \
+  KERNEL(void, cached_weights_backward, int64_t count, const uint32_t *entries, const uint32_t *blocks,          \
          const T *weights, const T *upstream, int64_t channels, T *d_value)                                      \
   KERNEL(int64_t, attention_scratch, const AttentionShape &)                                                     \
   KERNEL(void, attention, const Attention<T> &, Fused<T *> out, int64_t begin, int64_t end, T *scratch)          \
   KERNEL(void, attention_backward, const Attention<T> &, Fused<const T *> d_out, Fused<T *> d_in, int64_t begin, \
          int64_t end, T *scratch, AttentionLayers<T *> sums)                                                     \
-  KERNEL(T, multiply_add, int64_t rounds, T factor, T addend)                                                    \
+  KERNEL(T, peak_fma, int64_t rounds, T factor, T addend)                                                        \
   KERNEL(int64_t, ssim_scratch, const Ssim<T> &)                                                                 \
   KERNEL(void, ssim_map_rows, const Ssim<T> &, T *map, int64_t begin, int64_t end, T *scratch)                   \
   KERNEL(void, ssim_sum_rows, const Ssim<T> &, SsimSums *of_rows, int64_t begin, int64_t end, T *scratch)        \

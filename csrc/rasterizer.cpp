@@ -69,8 +69,9 @@ void refuse_upstream(const Pass<T> &p) {
 }  // namespace
 
 template <class T>
-Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vector<Chain<T>> chains,
-                std::vector<Part<T>> parts, const BlendConfig &config, bool keep, bool *visible, int threads)
+Rasterized<T>::Rasterized(const Grid &grid, int64_t n, const Splats<T> &splats, std::vector<Chain<T>> chains,
+                          std::vector<Part<T>> parts, const RasterizeConfig &config, bool keep, bool *visible,
+                          int threads)
     : n_(n), grid_(grid), config_(config), chains_(std::move(chains)), parts_(std::move(parts)) {
   std::vector<const T *> weights;
   if (n >= kCulled)
@@ -87,8 +88,8 @@ Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vecto
     stages_.push_back(make_stage(first, std::min(kMaxChains, num_chains - first)));
     fill_records(stages_.back(), splats, row_threads);
   }
-  lists_ = make_lists(grid, n, order_, stages_[0].records.data(), num_chains, T(config.alpha_min),
-                      config.trim, config.memory_budget, visible, row_threads);
+  lists_ = bin_gaussians(grid, n, order_, stages_[0].records.data(), num_chains, T(config.alpha_min),
+                         config.trim, config.memory_budget, visible, row_threads);
   order_.boxes = {};  // of no use from here on
   for (Stage &s : stages_) {
     if (keep) check_memory(s.pass);
@@ -97,7 +98,7 @@ Blend<T>::Blend(const Grid &grid, int64_t n, const Splats<T> &splats, std::vecto
 }
 
 template <class T>
-typename Blend<T>::Stage Blend<T>::make_stage(int first_chain, int num_chains) const {
+typename Rasterized<T>::Stage Rasterized<T>::make_stage(int first_chain, int num_chains) const {
   Stage s{};
   s.first_chain = first_chain;
   Pass<T> &p = s.pass;
@@ -139,7 +140,7 @@ typename Blend<T>::Stage Blend<T>::make_stage(int first_chain, int num_chains) c
 
 // In the order of the rows: one record is written out of order instead of seven arrays being read so.
 template <class T>
-void Blend<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) const {
+void Rasterized<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) const {
   Pass<T> &p = s.pass;
   s.records = Buffer<T>(order_.count * kRecord);
   p.records = s.records.data();
@@ -174,7 +175,7 @@ void Blend<T>::fill_records(Stage &s, const Splats<T> &splats, int threads) cons
 
 // Slots and their sums count towards the budget where gradients may be asked for.
 template <class T>
-void Blend<T>::check_memory(const Pass<T> &p) const {
+void Rasterized<T>::check_memory(const Pass<T> &p) const {
   const int64_t entries = lists_.begin.back();
   const int64_t slots = std::min(entries, std::max(entries_at_once(p), lists_.longest));
   const int64_t bytes = entries * int64_t(sizeof(uint32_t) + sizeof(uint16_t)) +
@@ -186,27 +187,28 @@ void Blend<T>::check_memory(const Pass<T> &p) const {
 }
 
 template <class T>
-void Blend<T>::render(Stage &s, bool keep, int threads) const {
+void Rasterized<T>::render(Stage &s, bool keep, int threads) const {
   Pass<T> &p = s.pass;
   p.tile_begin = lists_.begin.data(), p.ranks = lists_.ranks.data(), p.masks = lists_.masks.data();
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y, pixels = tiles * p.chains * kBlocks * kPixels;
   if (keep) s.transmittance = Buffer<T>(pixels), s.last = Buffer<T>(pixels);
   p.transmittance = s.transmittance.data(), p.last = s.last.data();
   const Kernels<T> &kernel = kernels<T>();
-  const int64_t size = kernel.blend_scratch(p, lists_.longest), list_size = lists_.longest + kListSlack;
+  const int64_t size = kernel.rasterize_forward_scratch(p, lists_.longest),
+                list_size = lists_.longest + kListSlack;
   const Buffer<T> scratch(threads * size);
   const Buffer<uint32_t> list(threads * list_size);
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int t = omp_get_thread_num();
-    kernel.blend(p, tile, scratch.data() + t * size, list.data() + t * list_size);
+    kernel.rasterize_forward(p, tile, scratch.data() + t * size, list.data() + t * list_size);
   }
 }
 
 // Sum of the slots of every rank, in the order of the tiles whatever the threads: [m, summed]. Wide channels
 // are added to d_values.
 template <class T>
-Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads) const {
+Buffer<T> Rasterized<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads) const {
   const int64_t tiles = p.grid.tiles_x * p.grid.tiles_y, size = p.slot_size;
   const int64_t num_sums = order_.count * summed(p), at_once = entries_at_once(p);
   std::vector<int64_t> strips = {0};  // first tile of each
@@ -219,7 +221,7 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads)
   strips.push_back(tiles);
 
   const Kernels<T> &kernel = kernels<T>();
-  const int64_t scratch_size = kernel.backward_scratch(p, lists_.longest);
+  const int64_t scratch_size = kernel.rasterize_backward_scratch(p, lists_.longest);
   Buffer<T> sums(num_sums), slots(most * size), scratch(threads * scratch_size);
   std::atomic<bool> bad = false;
 #pragma omp parallel num_threads(threads)
@@ -231,7 +233,7 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads)
 #pragma omp for schedule(dynamic)
       for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile) {
         T *mine = scratch.data() + omp_get_thread_num() * scratch_size;
-        if (!kernel.blend_backward(p, tile, mine, slots.data() + (p.tile_begin[tile] - base) * size))
+        if (!kernel.rasterize_backward(p, tile, mine, slots.data() + (p.tile_begin[tile] - base) * size))
           bad = true;
       }
 #pragma omp for schedule(static, 1)
@@ -248,8 +250,8 @@ Buffer<T> Blend<T>::sum_slots(const Pass<T> &p, T *const *d_values, int threads)
 
 // From moments to gradients (csrc/README.md), and from ranks to rows.
 template <class T>
-void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T> &sums,
-                               const BlendGrads<T> &d, int threads) const {
+void Rasterized<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T> &sums,
+                                    const RasterizeGrads<T> &d, int threads) const {
   constexpr T kPerOctave = T(1 / kOctaves), kPerOctave2 = T(1 / (kOctaves * kOctaves));
   const int64_t size = summed(p);
   const bool by_row = size < p.slot_size;
@@ -316,7 +318,7 @@ void Blend<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buffer<T>
 }
 
 template <class T>
-void Blend<T>::backward(const BlendGrads<T> &d, int threads) const {
+void Rasterized<T>::backward(const RasterizeGrads<T> &d, int threads) const {
   const int tile_threads = worth(lists_.begin.back() + grid_.tiles_x * grid_.tiles_y, threads);
   if (d.d_mean2d) std::fill_n(d.d_mean2d, 2 * n_, T(0));
   if (d.d_ellipse) std::fill_n(d.d_ellipse, 3 * n_, T(0));
@@ -353,8 +355,8 @@ void Blend<T>::backward(const BlendGrads<T> &d, int threads) const {
 }
 
 template <class T>
-BlendWork Blend<T>::work() const {
-  BlendWork work{lists_.begin.back(), 0};
+RasterizeWork Rasterized<T>::work() const {
+  RasterizeWork work{lists_.begin.back(), 0};
   for (const Stage &s : stages_) {
     const Pass<T> &p = s.pass;
     if (p.stop_before)
@@ -381,7 +383,7 @@ BlendWork Blend<T>::work() const {
   return work;
 }
 
-template class Blend<float>;
-template class Blend<double>;
+template class Rasterized<float>;
+template class Rasterized<double>;
 
 }  // namespace vlgs

@@ -4,7 +4,7 @@
 #include <string>
 #include <vector>
 
-#include "lists.h"
+#include "binning.h"
 
 namespace vlgs {
 
@@ -14,7 +14,7 @@ void project(const Camera &, int64_t n, const Gaussians<T> &, const Splats<T> &,
 template <class T>
 void project_backward(const Camera &, int64_t n, const Gaussians<T> &, const GaussianGrads<T> &, int threads);
 
-struct BlendConfig {
+struct RasterizeConfig {
   double alpha_min, alpha_max, transmittance_min;
   bool stop_before;
   int64_t memory_budget;  // bytes
@@ -30,7 +30,7 @@ struct Chain {
 };
 
 template <class T>
-struct BlendGrads {
+struct RasterizeGrads {
   std::vector<const T *> values;    // [n, channels] per part, as they were
   std::vector<const T *> d_images;  // per part; null where unused
   std::vector<const T *> d_alphas;  // per chain; null where unused
@@ -41,23 +41,23 @@ struct BlendGrads {
 };
 
 // What a forward pass took, for benchmarks.
-struct BlendWork {
+struct RasterizeWork {
   int64_t entries;  // of all tile lists
   int64_t weighed;  // (Gaussian, 4x4 block, chain) triples that blending went through
 };
 
 // One picture: blends on construction and keeps the lists for its gradients.
 template <class T>
-class Blend {
+class Rasterized {
  public:
   // `parts` are in the order of their chains. Without `keep` there is no backward pass.
-  Blend(const Grid &, int64_t n, const Splats<T> &, std::vector<Chain<T>>, std::vector<Part<T>> parts,
-        const BlendConfig &, bool keep, bool *visible, int threads);
+  Rasterized(const Grid &, int64_t n, const Splats<T> &, std::vector<Chain<T>>, std::vector<Part<T>> parts,
+             const RasterizeConfig &, bool keep, bool *visible, int threads);
 
-  void backward(const BlendGrads<T> &, int threads) const;
+  void backward(const RasterizeGrads<T> &, int threads) const;
 
   // Counted afterwards, from the lists and what is kept for backward: needs `keep` and not `stop_before`.
-  BlendWork work() const;
+  RasterizeWork work() const;
 
   int64_t rows() const { return n_; }
   const Pass<T> &pass() const { return stages_[0].pass; }  // of the first chains; valid while this lives
@@ -75,12 +75,12 @@ class Blend {
   void check_memory(const Pass<T> &) const;
   void render(Stage &, bool keep, int threads) const;
   Buffer<T> sum_slots(const Pass<T> &, T *const *d_values, int threads) const;
-  void write_gradients(const Stage &, const Pass<T> &, const Buffer<T> &sums, const BlendGrads<T> &,
+  void write_gradients(const Stage &, const Pass<T> &, const Buffer<T> &sums, const RasterizeGrads<T> &,
                        int threads) const;
 
   int64_t n_;
   Grid grid_;
-  BlendConfig config_;
+  RasterizeConfig config_;
   std::vector<Chain<T>> chains_;
   std::vector<Part<T>> parts_;
   DepthOrder<T> order_;

@@ -89,7 +89,7 @@ def main() -> None:
     seeds = range(args.first or 0, (args.first or 0) + args.scenes)
     if args.child:
         return fuzz_here(args.child, args.isa[0], seeds)
-    from tests.fuzz_kernel.sheet import CLEAN, run_fuzz
+    from tests.fuzz_kernel.record import CLEAN, run_fuzz
 
     module, failed = build(args.isa), False
     for isa in args.isa:

@@ -1,7 +1,7 @@
 // Chunks of fixed size, whatever the number of threads, and their sums added in order.
 #include <algorithm>
 
-#include "buffer.h"
+#include "buffer_pool.h"
 #include "kernels.h"
 
 namespace vlgs {

@@ -1,7 +1,7 @@
 // Bands of rows, one for each thread; a row's numbers do not depend on the band that it is in.
 #include <algorithm>
 
-#include "buffer.h"
+#include "buffer_pool.h"
 #include "kernels.h"
 #include "threads.h"
 

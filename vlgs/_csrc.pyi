@@ -10,7 +10,7 @@ def isa() -> str:
 def isas() -> str:
     """The instruction sets that were compiled and run on this machine, best first, separated by blanks."""
 
-def multiply_adds(packs: int) -> int: ...
+def peak_fma(packs: int) -> int: ...
 
 class Camera:
     def __init__(
@@ -22,7 +22,7 @@ class Camera:
         blur: float,
     ) -> None: ...
 
-class BlendConfig:
+class RasterizeConfig:
     def __init__(
         self,
         alpha_min: float,
@@ -59,7 +59,7 @@ def project_backward(
     threads: int,
 ) -> None: ...
 
-class BlendFloat:
+class RasterizedFloat:
     def __init__(
         self,
         mean2d: Tensor,
@@ -70,7 +70,7 @@ class BlendFloat:
         values: Sequence[Tensor],
         groups: Sequence[int],
         chain_of: Sequence[int],
-        config: BlendConfig,
+        config: RasterizeConfig,
         images: Sequence[Tensor],
         alphas: Sequence[Tensor],
         visible: Tensor,
@@ -91,7 +91,7 @@ class BlendFloat:
     def work(self) -> tuple[int, int]:
         """Entries of all tile lists, and (Gaussian, 4x4 block, chain) triples weighed; needs ``keep`` and ``stop="after"``."""
 
-class BlendDouble(BlendFloat): ...
+class RasterizedDouble(RasterizedFloat): ...
 
 def attention(
     color: Tensor,
@@ -186,12 +186,12 @@ def squared_error_backward(
     threads: int,
 ) -> None: ...
 
-class FrozenFloat:
-    def __init__(self, picture: BlendFloat, threads: int) -> None: ...
-    def keep(self, picture: BlendFloat, threads: int) -> None: ...
+class CachedWeightsFloat:
+    def __init__(self, picture: RasterizedFloat, threads: int) -> None: ...
+    def keep(self, picture: RasterizedFloat, threads: int) -> None: ...
     @property
     def bytes(self) -> int: ...
     def render(self, values: Tensor, image: Tensor, threads: int) -> None: ...
     def backward(self, d_image: Tensor, d_values: Tensor, threads: int) -> None: ...
 
-class FrozenDouble(FrozenFloat): ...
+class CachedWeightsDouble(CachedWeightsFloat): ...

@@ -21,10 +21,11 @@ from vlgs.values import require_range, require_types
 LEVELS = (1, 2, 3)
 """Mask levels of ``levels=separate`` and ``joint``: subpart, part, whole, finest first (conf/README.md, D.8)."""
 
+CODES: Mapping[str, int] = {"single": 1, "separate": 1, "joint": len(LEVELS)}
+"""Value of ``levels`` -> language codes of a Gaussian."""
+
 OmegaConf.register_new_resolver(
-    "code_channels",
-    lambda levels, width: width * (len(LEVELS) if levels == "joint" else 1),
-    replace=True,
+    "code_channels", lambda levels, width: width * CODES.get(levels, 1), replace=True
 )
 """``${code_channels:${levels},${head.dim}}``: language channels of a Gaussian, which is what a fusion is built for."""
 

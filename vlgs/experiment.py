@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from vlgs.config import instantiate
 from vlgs.demands import Demand, has, unmet
-from vlgs.identity import GIVEN_FILES, Identity, identity, run_id
+from vlgs.identity import GIVEN_FILES, RunIdentity, identity, run_id
 from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.places import record
@@ -69,7 +69,7 @@ class Experiment:
     """Name of the option of conf/data."""
     record: Mapping[str, Any]
     """The configuration in JSON values, as it is kept with the run."""
-    identity: Identity
+    identity: RunIdentity
     run_id: Callable[[str], str]
     """Takes what stands for the content of the data."""
 

@@ -76,7 +76,7 @@ they have; the default may be another. An entry stays as it is for as long as th
 
 
 @dataclass(frozen=True)
-class Identity:
+class RunIdentity:
     """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""
 
     recipe: str
@@ -93,14 +93,16 @@ def run_id(config: DictConfig, fingerprint: str) -> str:
     return _digest(_without_files(plain) | {"data": fingerprint})
 
 
-def identity(config: DictConfig) -> Identity:
-    """What tells runs of a table apart; see `Identity`."""
+def identity(config: DictConfig) -> RunIdentity:
+    """What tells runs of a table apart; see `RunIdentity`."""
     plain = _plain(config)
     data, seed = plain.pop("data"), plain.pop("seed")
     given = {former(".".join(key)): (plain.get(key[0]) or {}).get(key[1]) for key in GIVEN_FILES}
     names = {key: Path(str(path)).name for key, path in given.items() if path is not None}
     read = {key: value for key, value in data.items() if key not in PLACES}
-    return Identity(_digest(_without_files(plain) | names), _digest(_counted(read, "data")), seed)
+    return RunIdentity(
+        _digest(_without_files(plain) | names), _digest(_counted(read, "data")), seed
+    )
 
 
 def moves(key: str) -> bool:

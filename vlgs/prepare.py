@@ -12,7 +12,7 @@ import torch
 from vlgs.data.diagnostics import Fault, warning
 from vlgs.experiment import Experiment, Scenes
 from vlgs.formats import file_digest
-from vlgs.heads.autoencoder import Autoencoder
+from vlgs.heads import FittedHead
 from vlgs.ops.rasterize import check_config as check_constants
 from vlgs.query import TextEncoder, encode_questions, words_of
 from vlgs.query.text import VocabularyText
@@ -135,9 +135,8 @@ def rehearse(ready: Prepared) -> None:
     def make_parts() -> Parts:
         parts = experiment.make_parts()
         head, trainer = parts.head, parts.trainer
-        if isinstance(head, Autoencoder):
-            steps = min(_STEPS, head.fit_settings.steps)
-            head.fit_settings, head.cache_dir = replace(head.fit_settings, steps=steps), None
+        if isinstance(head, FittedHead):
+            head.rehearse(_STEPS)
         return replace(parts, trainer=replace(trainer, iterations=min(_STEPS, trainer.iterations)))
 
     _, *further = experiment.stages()  # views are not added: that takes as long as the run

@@ -15,7 +15,7 @@ import pytest
 from vlgs.ablate import __main__ as runner
 from vlgs.ablate import job
 from vlgs.ablate.__main__ import Request, ablate, read
-from vlgs.ablate.job import Outcome, read_outcome, run_and_record
+from vlgs.ablate.job import JobOutcome, read_outcome, run_and_record
 from vlgs.ablate.plan import plan
 from vlgs.ablate.progress import Count, count
 from vlgs.config import override_value
@@ -261,19 +261,19 @@ def test_the_command_line_is_split():
 
 
 def test_outcomes_are_told_apart():
-    assert Outcome(0).done
-    assert Outcome(UNSCORED).done
-    assert Outcome(None, 0.0, "x").lost
-    assert Outcome(-9).lost
-    assert Outcome(STOPPED).lost  # by someone else: a queue that wants its machine back
-    assert not Outcome(1).lost
-    assert Outcome().reason() == "it was never started"
+    assert JobOutcome(0).done
+    assert JobOutcome(UNSCORED).done
+    assert JobOutcome(None, 0.0, "x").lost
+    assert JobOutcome(-9).lost
+    assert JobOutcome(STOPPED).lost  # by someone else: a queue that wants its machine back
+    assert not JobOutcome(1).lost
+    assert JobOutcome().reason() == "it was never started"
 
 
 def test_progress_counts_and_estimates():
     before = Count(total=10, done=3, failed=1, seconds_per_run=100.0)
-    jobs = [Outcome(0, 30.0, "a"), Outcome(0, 50.0, "b"), Outcome(1, 5.0, "c"), Outcome(75, 5.0, "d"),
-            Outcome(None, 10.0, "e"), Outcome(None, 10.0, "f"), Outcome()]  # fmt: skip
+    jobs = [JobOutcome(0, 30.0, "a"), JobOutcome(0, 50.0, "b"), JobOutcome(1, 5.0, "c"), JobOutcome(75, 5.0, "d"),
+            JobOutcome(None, 10.0, "e"), JobOutcome(None, 10.0, "f"), JobOutcome()]  # fmt: skip
     now = count(before, jobs)
     assert (now.done, now.running, now.failed, now.remaining) == (5, 2, 2, 3)
     assert now.seconds_per_run == 40.0
@@ -311,10 +311,10 @@ def test_runs_that_were_never_started_are_not_given_up(table: Table):
     run = plan([table], Benchmark("b", ("data=synthetic",), ("glassware",), (0,)))[0]
     tally = runner.Tally()
     for _ in range(2 * runner.TRIES):
-        tally.add(run, Outcome())
+        tally.add(run, JobOutcome())
     assert not tally.failed
     for _ in range(runner.TRIES):
-        tally.add(run, Outcome(None, 1.0, "begun.log"))
+        tally.add(run, JobOutcome(None, 1.0, "begun.log"))
     assert "its worker died" in tally.failed[run.name]
 
 

@@ -10,7 +10,7 @@ import pytest
 from vlgs.bench.__main__ import SUBCOMMANDS, main
 from vlgs.bench.growth import Point, run_growth
 from vlgs.bench.kernel import BOUND_RATE, SIZES, Figures, Job, Size, _elsewhere, run_kernel
-from vlgs.bench.sheet import provenance, read_sheet
+from vlgs.bench.record import provenance, read_record
 
 HEADER = {"command", "cpu", "cores", "isa", "load", "commit", "seed", "torch"}
 TIMES = {f"{way}_{what}" for way in ("forward", "backward") for what in ("ms", "q1", "q3", "cpu")}
@@ -25,7 +25,7 @@ def test_kernel_times_both_parts_and_the_reference(tmp_path: Path):
     size = Size(60, 32, 24, 1.0, Figures(2.0, (6.0, 3.0)), Figures(4.0, (16.0, 8.0)))
     dense = [Size(20, 16, 12)]
     rows = run_kernel([size], dense, [3, 5, 16], [1], ["base"], 2, tmp_path)
-    table = read_sheet(tmp_path / "kernel.csv")
+    table = read_record(tmp_path / "kernel.csv")
     assert header(tmp_path / "kernel.csv") >= HEADER
     assert set(table) >= TIMES | {"job_threads", "isa", "repeats", "opensplat_ms", "ratio"}
     assert list(table.job_part) == ["call", "blend"] * 3 + ["call", "reference"]
@@ -66,7 +66,7 @@ def test_growth_has_slopes_within_a_series(tmp_path: Path):
     points = [Point("gaussians", n, n, 16, 12, 3, 1) for n in (20, 40)]
     points += [Point("channels", c, 20, 16, 12, c, 1) for c in (1, 4)]
     run_growth(points, 2, tmp_path, seed=0)
-    table = read_sheet(tmp_path / "growth.csv")
+    table = read_record(tmp_path / "growth.csv")
     assert set(table) >= TIMES | {"point_axis", "point_value", "slope"}
     assert table.slope.notna().tolist() == [False, True, False, True]
     assert (tmp_path / "growth.png").stat().st_size > 0
@@ -78,9 +78,9 @@ def test_reading_and_protocols_leave_their_stages_and_costs(tmp_path: Path):
     for name in ("reading", "protocols"):
         assert main([name, "--quick", "--out", str(tmp_path)]) == 0
         assert header(tmp_path / f"{name}.csv") >= HEADER
-        table = read_sheet(tmp_path / f"{name}.csv")
+        table = read_record(tmp_path / f"{name}.csv")
         assert ((table.wall_seconds > 0) & (table.cpu_seconds > 0) & (table.peak_mib > 50)).all()
-    reading, protocols = (read_sheet(tmp_path / f"{n}.csv") for n in ("reading", "protocols"))
+    reading, protocols = (read_record(tmp_path / f"{n}.csv") for n in ("reading", "protocols"))
     for _, stages in reading.groupby("language"):
         assert list(stages.stage)[:4] == [
             *("imports", "scene read", "Gaussians and head", "first step")

@@ -12,6 +12,7 @@ from vlgs.bench.checks import check_dense, check_presets, check_rounding, violat
 from vlgs.bench.memory import measure_memory
 from vlgs.bench.pareto import front, run_pareto
 from vlgs.bench.presets import raster_presets
+from vlgs.bench.record import read_record
 from vlgs.bench.scenes import (
     LEAVES,
     in_precision,
@@ -19,11 +20,10 @@ from vlgs.bench.scenes import (
     save_workload,
     with_one_weight,
 )
-from vlgs.bench.sheet import read_sheet
 from vlgs.bench.switches import check_switch, raster_switches
 from vlgs.bench.workload import Workload, make_workload
-from vlgs.ops.blend import count_work
 from vlgs.ops.project import project
+from vlgs.ops.rasterize_to_pixels import count_work
 from vlgs.types import RasterConfig
 
 
@@ -46,7 +46,7 @@ def test_the_truth_without_cutoffs_is_the_plain_sum(w: Workload):
 
 def test_errors_are_the_norms_that_they_are_called(w: Workload):
     true = outcome.outcome(in_precision(w, torch.float64), RasterConfig())
-    got = outcome.Outcome(
+    got = outcome.RasterOutcome(
         (true.images[0] + 0.25, true.images[1]),
         {**true.gradients, "means": -2 * true.gradients["means"]},
     )
@@ -166,7 +166,7 @@ def test_memory_grows_with_the_image(tmp_path: Path):
 
 def test_error_and_pareto_write_their_files(tmp_path: Path, w: Workload):
     assert error.run_error({"tiny": w}, None, [1], 1, tmp_path, 0) == []
-    table = read_sheet(tmp_path / "error.csv")
+    table = read_record(tmp_path / "error.csv")
     assert set(table) >= {
         "scene", "variant", "precision", "threads", "truth", "forward_ms", "backward_cpu", "skipped",
         "memory_rss_mib", "memory_extra_mib", "error_image_max", "error_image_mean",
@@ -181,7 +181,7 @@ def test_error_and_pareto_write_their_files(tmp_path: Path, w: Workload):
     run_pareto(tmp_path)
     for name in ("pareto.png", "pareto_rounding.pdf"):
         assert (tmp_path / name).stat().st_size > 0
-    points = read_sheet(tmp_path / "pareto.csv")
+    points = read_record(tmp_path / "pareto.csv")
     assert points.groupby(["scene", "truth"]).front_worst_gradient.any().all()
 
 

@@ -11,11 +11,11 @@ from vlgs.bench import error, steps
 from vlgs.bench.checks import Check, violated
 from vlgs.bench.one_step import StepSwitch, measure_step, run_step, step_switches, turned
 from vlgs.bench.presets import Trained, train_a_little
-from vlgs.bench.sheet import read_sheet
+from vlgs.bench.record import read_record
 from vlgs.bench.steps import measure_switches
 from vlgs.bench.train import QUICK
 from vlgs.bench.workload import make_workload
-from vlgs.ops.cached_weights import FrozenView
+from vlgs.ops.cached_weights import CachedView
 from vlgs.skips import SKIPS
 from vlgs.training.state import capture
 from vlgs.types import Camera
@@ -62,8 +62,8 @@ def test_every_switch_of_training_has_a_row_and_keeps_its_promise(trained: Train
 def test_a_skip_that_moves_numbers_breaks_its_promise(
     trained: Trained, monkeypatch: pytest.MonkeyPatch
 ):
-    product = FrozenView.render
-    monkeypatch.setattr(FrozenView, "render", lambda self, v: 0.9999 * product(self, v))
+    product = CachedView.render
+    monkeypatch.setattr(CachedView, "render", lambda self, v: 0.9999 * product(self, v))
     broken = violated(measure_switches("q", trained.module, 1, 1, draws=20)[1])
     assert [c.promise.partition(":")[0] for c in broken] == ["frozen_weights"]
 
@@ -123,10 +123,10 @@ def test_rows_go_into_a_file_of_their_own(
     monkeypatch.setattr(error, "_print", lambda _: None)
     scene = {"tiny": make_workload(60, 16, 16)}
     assert error.run_error(scene, None, [1], 1, tmp_path, 0, trained) == []
-    table = read_sheet(tmp_path / "error_steps.csv")
+    table = read_record(tmp_path / "error_steps.csv")
     assert set(table) >= {
         "scene", "switch", "on_forward_ms", "off_backward_cpu", "skipped", "loss_error", "loss_bound",
         "image_max", "l2_splats.features", "cos_fusion.qkv.weight",
     }  # fmt: skip
-    promises = read_sheet(tmp_path / "error_checks.csv").promise
+    promises = read_record(tmp_path / "error_checks.csv").promise
     assert "blend_reuse: on against off, camera" in list(promises)

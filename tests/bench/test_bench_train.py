@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from vlgs.bench import curve, train
 from vlgs.bench.curve import evaluated_at, seconds_to
 from vlgs.bench.presets import composed
-from vlgs.bench.sheet import read_sheet
+from vlgs.bench.record import read_record
 from vlgs.skips import SKIPS
 
 
@@ -54,7 +54,7 @@ def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert rows[0].psnr is not None
     files = list((tmp_path / "train").glob("*.csv"))
     assert len(files) == 1
-    table = read_sheet(files[0])
+    table = read_record(files[0])
     assert list(table.iteration) == [2, 6]
     assert table.seconds.is_monotonic_increasing
     assert set(table) >= {"cpu_seconds", "psnr", "miou", "gaussians"}

@@ -10,7 +10,7 @@ from vlgs.bench import unseen
 from vlgs.bench.__main__ import main
 from vlgs.bench.lonely import share_lonely, view_weights
 from vlgs.bench.presets import train_a_little
-from vlgs.bench.sheet import read_sheet
+from vlgs.bench.record import read_record
 from vlgs.bench.unseen import QUICK, make_tasks, summary
 from vlgs.bench.unseen_row import UnseenRow
 
@@ -19,7 +19,7 @@ def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command = ["unseen", "--quick", "--scenes", "mirrors_sky", "--out", str(tmp_path)]
     short = ["--override", "trainer.iterations=6", "data.cache=null"]
     assert main([*command, *short]) == 0
-    table = read_sheet(tmp_path / "unseen.csv")
+    table = read_record(tmp_path / "unseen.csv")
     assert list(table.scene) == ["mirrors_sky"]
     assert (table.worst <= table.psnr).all()
     assert table.lonely.between(0, 1).all()
@@ -29,7 +29,7 @@ def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(unseen, "fit", lambda *_: pytest.fail("trained again"))
     assert main([*command, *short]) == 0
-    assert len(read_sheet(tmp_path / "unseen.csv")) == 1
+    assert len(read_record(tmp_path / "unseen.csv")) == 1
 
 
 def test_spread_is_over_seeds_and_worst_over_views():

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from vlgs.data.export import write_scene
-from vlgs.data.synthetic import Recipe, language_levels, load_scene
+from vlgs.data.synthetic import SceneSettings, language_levels, load_scene
 from vlgs.types import ObjectLabels, Scene, View
 
 SIZE: dict[str, Any] = {"width": 64, "height": 48, "train_views": 4, "test_views": 2}
@@ -42,7 +42,7 @@ def objects(view: View) -> ObjectLabels:
 
 
 def _write_colmap(scene: Scene, folder: Path) -> None:
-    levels = language_levels(Recipe(**SIZE))
+    levels = language_levels(SceneSettings(**SIZE))
     language = dict(zip((view.name for view in scene.train), levels.values(), strict=True))
     some = next(iter(language.values()))
     # A release has language maps of every image; those of the held-out ones are never compared.

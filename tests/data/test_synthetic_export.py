@@ -19,7 +19,7 @@ from vlgs.data.export.outline import outlines
 from vlgs.data.labels.objects import crosses_itself, fill_polygons
 from vlgs.data.sparse import read_cameras
 from vlgs.data.sparse.write import write_colmap
-from vlgs.data.synthetic import Recipe, language_levels, load_scene
+from vlgs.data.synthetic import SceneSettings, language_levels, load_scene
 from vlgs.types import ObjectLabels, View
 
 SIZE: dict[str, Any] = {"width": 96, "height": 72, "train_views": 4, "test_views": 2}
@@ -33,7 +33,7 @@ def scene():
 @pytest.fixture(scope="module")
 def folder(scene, tmp_path_factory):
     root = tmp_path_factory.mktemp("written") / "new" / "scene"
-    write_scene(scene, root, language_levels(Recipe(**SIZE)))
+    write_scene(scene, root, language_levels(SceneSettings(**SIZE)))
     return root
 
 
@@ -148,7 +148,7 @@ def test_nothing_is_overwritten_and_nothing_half_written(scene, tmp_path):
         write_scene(scene, tmp_path)
     with pytest.raises(ValueError, match="language must name views of the scene, got nobody"):
         write_scene(scene, tmp_path / "a", {"nobody": ()})
-    levels = language_levels(Recipe(**SIZE))
+    levels = language_levels(SceneSettings(**SIZE))
     name = scene.train[0].name
     with pytest.raises(ValueError, match="language must have 4 levels, got 3"):
         write_scene(scene, tmp_path / "b", {name: levels[name][1:]})

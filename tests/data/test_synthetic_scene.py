@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from torch import Tensor
 
-from vlgs.data.synthetic import NO_NOISE, LabelNoise, Recipe, capture, load_scene
+from vlgs.data.synthetic import NO_NOISE, LabelNoise, SceneSettings, capture, load_scene
 from vlgs.data.synthetic.labels import components, object_labels
 from vlgs.data.synthetic.layouts import DIFFICULTIES
 from vlgs.data.synthetic.scene_file import find_scene
@@ -97,14 +97,14 @@ def test_the_same_arguments_give_the_same_bits():
     ],
 )
 def test_whatever_changes_the_scene_changes_the_fingerprint(change):
-    base = Recipe(**SMALL)
-    assert base.fingerprint(3) != Recipe(**{**SMALL, **change}).fingerprint(3)
+    base = SceneSettings(**SMALL)
+    assert base.fingerprint(3) != SceneSettings(**{**SMALL, **change}).fingerprint(3)
     assert base.fingerprint(3) != base.fingerprint(2)
 
 
 def test_a_fault_written_out_is_the_same_as_the_preset():
-    written = Recipe(**SMALL, faults=LabelNoise(missed=0.05))
-    assert written.fingerprint(3) == Recipe(**SMALL).fingerprint(3)
+    written = SceneSettings(**SMALL, faults=LabelNoise(missed=0.05))
+    assert written.fingerprint(3) == SceneSettings(**SMALL).fingerprint(3)
     assert load_scene(**SMALL).fingerprint == written.fingerprint(3)
 
 
@@ -191,7 +191,7 @@ def test_points_project_onto_pixels_of_their_colour(scene):
 
 def test_points_lie_on_the_surfaces_that_their_view_sees():
     scene = load_scene("lookalikes", **SMALL)
-    taken = capture.open_capture(Recipe(find_scene("lookalikes"), **SMALL))
+    taken = capture.open_capture(SceneSettings(find_scene("lookalikes"), **SMALL))
     assert len(scene.points) == 4000  # nothing of glass or steel here, so every candidate is kept
     for shot, points in zip(taken.train, scene.points.split(1000), strict=True):
         center = camera_center(shot.camera.viewmat.double()).numpy()[:, None]
@@ -245,7 +245,9 @@ def test_configuration_mirrors_the_function():
     assert defaults.pop("cache") is None
     assert config == defaults
     named: dict[str, Any] = {"scene": find_scene(defaults["scene"])}
-    assert Recipe() == Recipe(**{k: v for k, v in (defaults | named).items() if k != "level"})
+    assert SceneSettings() == SceneSettings(
+        **{k: v for k, v in (defaults | named).items() if k != "level"}
+    )
 
 
 @settings(max_examples=40, deadline=None)

@@ -133,7 +133,7 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path):
 
 
 def test_the_scenes_of_the_package_are_what_they_were():
-    """Their fingerprints do not see their files: raise VERSION in vlgs/data/synthetic/recipe.py where one is changed."""
+    """Their fingerprints do not see their files: raise VERSION in vlgs/data/synthetic/settings.py where one is changed."""
     folder = ROOT / "vlgs/data/synthetic"
     assert len(SCENES) == 16
     text = [read_yaml(folder / "props.yaml").value]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests import fuzz
 from tests.fuzz._table import FamilyRow, attacked, begun, write_row
-from tests.fuzz.judge import Outcome, run_attack, scratch
+from tests.fuzz.judge import AttackOutcome, run_attack, scratch
 from vlgs.text import screen
 
 SAVED_EVERY = 30
@@ -30,7 +30,7 @@ def families() -> list[str]:
 
 def run_family(
     name: str, seed: int, count: int, every: int = 1, only: int | None = None, first: int = 0
-) -> Iterator[tuple[int, Outcome]]:
+) -> Iterator[tuple[int, AttackOutcome]]:
     """Numbers and outcomes of one family: of each `every`-th attack from `first` on, or of one alone."""
     folder = scratch()
     try:

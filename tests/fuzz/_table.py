@@ -5,8 +5,8 @@ import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tests.fuzz.judge import Outcome
-from vlgs.bench.sheet import read_sheet, write_sheet
+from tests.fuzz.judge import AttackOutcome
+from vlgs.bench.record import read_record, write_record
 from vlgs.report.provenance import PACKAGE, commit, machine
 
 CODE = ("vlgs", "csrc", "conf")
@@ -32,7 +32,7 @@ class FamilyRow:
     """Growth of the peak memory of a process."""
     wall_s: float = 0.0
 
-    def plus(self, outcome: Outcome, wall: float) -> "FamilyRow":
+    def plus(self, outcome: AttackOutcome, wall: float) -> "FamilyRow":
         """With one more attack."""
         return replace(
             self,
@@ -72,9 +72,9 @@ def write_row(path: Path, row: FamilyRow) -> None:
     rows = [*(other for other in _read(path) if other.family != row.family), row]
     load = f"{os.getloadavg()[0]:.2f} (one-minute average at the end)"
     header = {"command": COMMANDS, **machine(), "load": load}
-    write_sheet(path, sorted(rows, key=lambda line: line.family), header)
+    write_record(path, sorted(rows, key=lambda line: line.family), header)
 
 
 def _read(path: Path) -> list[FamilyRow]:
-    lines = read_sheet(path).to_dict("records") if path.is_file() else []
+    lines = read_record(path).to_dict("records") if path.is_file() else []
     return [FamilyRow(**{str(key): value for key, value in line.items()}) for line in lines]

@@ -43,7 +43,7 @@ class Attack:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class AttackOutcome:
     """What became of an attack."""
 
     name: str
@@ -56,7 +56,7 @@ class Outcome:
     """Growth of the peak memory."""
 
 
-def run_attack(attack: Attack) -> Outcome:
+def run_attack(attack: Attack) -> AttackOutcome:
     """Fork, attack, judge."""
     with tempfile.TemporaryFile() as pipe:
         child = os.fork()
@@ -71,7 +71,9 @@ def run_attack(attack: Attack) -> Outcome:
     seconds = usage.ru_utime + usage.ru_stime
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     megabytes = max(0, usage.ru_maxrss - before) / 1024
-    return Outcome(attack.name, *_judge(attack, kind, said, seconds, megabytes), seconds, megabytes)
+    return AttackOutcome(
+        attack.name, *_judge(attack, kind, said, seconds, megabytes), seconds, megabytes
+    )
 
 
 def _judge(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz._table import FamilyRow, begun, write_row
-from tests.fuzz.judge import Outcome
+from tests.fuzz.judge import AttackOutcome
 
 SAMPLES = {
     "files": ("--count", "40"),
@@ -36,7 +36,7 @@ def test_a_sample_of_the_attacks_is_met_rightly(family: str):
 def test_a_family_is_gone_on_with_on_the_same_code_alone(tmp_path: Path):
     fresh, path = FamilyRow("files", 100, 0, "abc"), tmp_path / "attacks.csv"
     assert begun(path, fresh) == fresh
-    outcome = Outcome("cut", True, "", seconds=0.25, megabytes=3.0)
+    outcome = AttackOutcome("cut", True, "", seconds=0.25, megabytes=3.0)
     write_row(path, fresh.plus(outcome, wall=1.0))
     write_row(path, FamilyRow("bombs", 100, 0, "abc", tried=2, right=1))
     assert begun(path, fresh) == fresh.plus(outcome, wall=1.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from tests.fuzz_kernel.layers import run_frozen, run_layers
+from tests.fuzz_kernel.layers import run_cached_view, run_layers
 from tests.fuzz_kernel.scene import POISON, FuzzScene, make_scene
 from vlgs.ops.rasterize import rasterize
 from vlgs.types import Rendered
@@ -39,7 +39,7 @@ def run_scene(scene: FuzzScene) -> str | None:
     """Render and differentiate; returns the message of a named error, or None where all is finite.
 
     After a full backward pass: the same picture without gradients, a backward pass for some gradients of some pictures, the first
-    group as a frozen view, and the list of what may be seen.
+    group as a cached view, and the list of what may be seen.
 
     Raises:
         AssertionError: If a result is not finite, has another shape than it should, differs where it should not, or a tame scene
@@ -58,9 +58,9 @@ def run_scene(scene: FuzzScene) -> str | None:
         _require(bool(NAMED.match(str(error))), f"error without a name: {error}")
         _require(not scene.tame, f"a tame scene was refused: {error}")
         return str(error)
-    # A frozen view also refuses values of Gaussians out of sight, which the rasterizer never reads.
+    # A cached view also refuses values of Gaussians out of sight, which the rasterizer never reads.
     if scene.tensors["values0"].isfinite().all() and scene.shape_of[0] is None:
-        run_frozen(scene.tensors, scene.width, scene.height, scene.config, out.images[0])
+        run_cached_view(scene.tensors, scene.width, scene.height, scene.config, out.images[0])
     return None
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.fuzz_kernel import fuzz
-from tests.fuzz_kernel.sheet import CLEAN, run_fuzz
+from tests.fuzz_kernel.record import CLEAN, run_fuzz
 from vlgs.ops.machine import instruction_set
 
 

@@ -1,4 +1,4 @@
-"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, losses, frozen views, the yardstick.
+"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, losses, cached views, peak_fma.
 
 What `tests.fuzz_kernel` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
 four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite. Squared errors are
@@ -13,8 +13,8 @@ from torch import Tensor
 
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
-from vlgs.ops.cached_weights import FrozenView
-from vlgs.ops.machine import multiply_adds
+from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.machine import peak_fma
 from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, RasterConfig
 
@@ -44,13 +44,13 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
     _squared_error(rng, poison)
     packs = int(rng.integers(0, 1000))
-    _require(multiply_adds(packs) >= packs, "the yardstick did less than it was asked for")
+    _require(peak_fma(packs) >= packs, "peak_fma did less than it was asked for")
 
 
-def run_frozen(
+def run_cached_view(
     tensors: dict[str, Tensor], width: int, height: int, config: RasterConfig, picture: Tensor
 ) -> None:
-    """The first group of a scene as a frozen view: the same picture to rounding, finite gradients.
+    """The first group of a scene as a cached view: the same picture to rounding, finite gradients.
 
     Args:
         tensors: Of a `tests.fuzz_kernel.scene.FuzzScene` that was rendered without complaint.
@@ -64,15 +64,15 @@ def run_frozen(
     """
     camera = Camera(tensors["viewmat"], tensors["K"], width, height)
     means, quats, scales = tensors["means"], tensors["quats"], tensors["scales"]
-    view = FrozenView(means, quats, scales, tensors["weight0"], camera, config)
+    view = CachedView(means, quats, scales, tensors["weight0"], camera, config)
     values = tensors["values0"].clone().requires_grad_()
     image = view.render(values)
     # Sums of up to 200 terms in another order.
     bound = 200 * torch.finfo(values.dtype).eps * (values.detach().abs().amax().item() if len(values) else 0.0)  # fmt: skip
     difference = (image - picture).detach().abs().amax().item()
-    _require(difference <= bound, f"frozen view is off by {difference}, more than {bound}")
+    _require(difference <= bound, f"cached view is off by {difference}, more than {bound}")
     (gradient,) = torch.autograd.grad(image, values, torch.ones_like(image))
-    _require(bool(gradient.isfinite().all()), "gradient of a frozen view is not finite")
+    _require(bool(gradient.isfinite().all()), "gradient of a cached view is not finite")
 
 
 Call = tuple[Callable[..., tuple[Tensor, ...]], list[Tensor]]

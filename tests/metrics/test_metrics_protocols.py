@@ -12,7 +12,7 @@ from vlgs.metrics.goi import Goi
 from vlgs.metrics.lerf_ovs import LerfOvs
 from vlgs.metrics.masks import Unit
 from vlgs.metrics.ovs3d import OVS3D, Ovs3dArgmax, Ovs3dThreshold, select_level
-from vlgs.metrics.protocol import Auto, EvaluationProtocol, Evidence, Figures, Splats, tag
+from vlgs.metrics.protocol import Auto, EvaluationProtocol, Evidence, Figures, GaussianEvidence, tag
 from vlgs.metrics.segment import LANGSPLAT_V2, Constants
 from vlgs.metrics.select3d import Select3d
 
@@ -32,10 +32,10 @@ def halves() -> list[torch.Tensor]:
     return masks
 
 
-def splats(relevancy: torch.Tensor) -> Splats:
+def splats(relevancy: torch.Tensor) -> GaussianEvidence:
     """One opaque Gaussian per pixel."""
     levels = relevancy if relevancy.ndim == 4 else relevancy[None]
-    return Splats(
+    return GaussianEvidence(
         [level.flatten(1) for level in levels],
         lambda level, selected: selected.reshape(H, W).float() * 0.9,
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 import vlgs.ops
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
-from vlgs.ops.cached_weights import FrozenView
+from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.ssim import KERNELS
 from vlgs.ops.view_color import view_color
@@ -37,7 +37,7 @@ CALLS: dict[str, Callable[[], object]] = {
     "squared_error": lambda: masked_mse(there(4, 5, 3), there(4, 5, 3)),
     "ssim": lambda: ssim_map(there(4, 5, 3), there(4, 5, 3)),
     "l1_dssim": lambda: l1_dssim(there(4, 5, 3), there(4, 5, 3)),
-    "project of a frozen view": lambda: FrozenView(
+    "project of a cached view": lambda: CachedView(
         *GAUSSIANS, there(5), Camera(torch.eye(4), K, 4, 4), RasterConfig()
     ),
 }

@@ -4,12 +4,12 @@ import math
 from dataclasses import replace
 
 import torch
-from render_scenes import Splats, camera_at_origin, random_splats
+from render_scenes import RenderScene, camera_at_origin, random_splats
 
 ULP = 2.0**-52
 
 
-def opaque_stack() -> Splats:
+def opaque_stack() -> RenderScene:
     s = random_splats(30, seed=5)
     means = torch.zeros(30, 3).double()
     means[:, 2] = torch.linspace(2, 4, 30)
@@ -20,7 +20,7 @@ def opaque_stack() -> Splats:
     )
 
 
-def needles() -> Splats:
+def needles() -> RenderScene:
     """Long and thin at 45 degrees on the image, up to thousands of pixels."""
     s = random_splats(24, seed=6)
     viewmat, _ = camera_at_origin()
@@ -33,7 +33,7 @@ def needles() -> Splats:
     return replace(s, means=means, quats=quats, scales=scales, viewmat=viewmat)
 
 
-def near_plane_and_behind() -> Splats:
+def near_plane_and_behind() -> RenderScene:
     s = random_splats(16, seed=7)
     viewmat, _ = camera_at_origin()
     depths = [
@@ -59,7 +59,7 @@ def near_plane_and_behind() -> Splats:
     return replace(s, means=means, scales=0.02 * s.scales, viewmat=viewmat)
 
 
-def far_off_axis() -> Splats:
+def far_off_axis() -> RenderScene:
     """Both sides of the field-of-view clamp, on each of its four edges."""
     s = random_splats(32, seed=8)
     viewmat, _ = camera_at_origin()
@@ -70,7 +70,7 @@ def far_off_axis() -> Splats:
     return replace(s, means=means, scales=s.scales * 6, viewmat=viewmat)
 
 
-def depth_ties() -> Splats:
+def depth_ties() -> RenderScene:
     s = random_splats(40, seed=9)
     viewmat, _ = camera_at_origin()
     means = s.means.clone()
@@ -78,7 +78,7 @@ def depth_ties() -> Splats:
     return replace(s, means=means, viewmat=viewmat)
 
 
-def no_rotation() -> Splats:
+def no_rotation() -> RenderScene:
     s = random_splats(20, seed=10)
     quats = s.quats.clone()
     quats[::3] = 0
@@ -87,7 +87,7 @@ def no_rotation() -> Splats:
     return replace(s, quats=quats)
 
 
-def weights_at_the_edges() -> Splats:
+def weights_at_the_edges() -> RenderScene:
     """At the centre of a pixel the exponent is 0, so that alpha is the weight to the last bit."""
     edges = [
         0,
@@ -121,7 +121,7 @@ def weights_at_the_edges() -> Splats:
     )
 
 
-def pancakes_and_specks() -> Splats:
+def pancakes_and_specks() -> RenderScene:
     s = random_splats(30, seed=12)
     scales = s.scales.clone()
     scales[:10, 2] = 0

@@ -15,7 +15,7 @@ WIDTH, HEIGHT = 37, 29  # odd, unequal, and neither a multiple of a block nor of
 
 
 @dataclass(frozen=True)
-class Splats:
+class RenderScene:
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
     scales: Float[Tensor, "n 3"]
@@ -28,7 +28,7 @@ class Splats:
     height: int = HEIGHT
     shape_grads: tuple[bool, ...] = (True,) * 8
 
-    def to(self, dtype: torch.dtype) -> "Splats":
+    def to(self, dtype: torch.dtype) -> "RenderScene":
         weights = {id(w): w.to(dtype) for w in self.weights}
         return replace(
             self,
@@ -48,7 +48,7 @@ def camera_at_origin(width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, 
 
 def random_splats(
     n: int, seed: int, channels: Sequence[int] = (3, 3), spread: float = 0.8
-) -> Splats:
+) -> RenderScene:
     """Gaussians in front of, around and a few behind a turned camera; float64 numbers that float32 holds exactly."""
     rng = torch.Generator().manual_seed(seed)
 
@@ -61,7 +61,7 @@ def random_splats(
     in_camera = normal(n, 3) * torch.tensor([1.2, 0.9, 1.0]) + torch.tensor([0.0, 0.0, 2.5])
     means = (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
     scales = torch.exp(spread * normal(n, 3) - 2)
-    splats = Splats(
+    splats = RenderScene(
         means, normal(n, 4), scales,
         tuple(torch.rand(n, generator=rng).double() for _ in channels),
         tuple(normal(n, c) for c in channels),
@@ -71,7 +71,7 @@ def random_splats(
 
 
 def render(
-    splats: Splats, backend: str = "cpu", config: RasterConfig | None = None
+    splats: RenderScene, backend: str = "cpu", config: RasterConfig | None = None
 ) -> tuple[Rendered, dict[str, Tensor]]:
     """Render with leaves that require gradients; returns the leaves by name."""
     leaves = {name: getattr(splats, name) for name in ("means", "quats", "scales")}
@@ -91,7 +91,7 @@ def render(
 
 
 def render_with_gradients(
-    splats: Splats,
+    splats: RenderScene,
     backend: str = "cpu",
     config: RasterConfig | None = None,
     weight: Tensor | float = 1.0,
@@ -113,7 +113,7 @@ def render_with_gradients(
     }
 
 
-def sure_pixels(splats: Splats, config: RasterConfig, band: float) -> Bool[Tensor, "h w"]:
+def sure_pixels(splats: RenderScene, config: RasterConfig, band: float) -> Bool[Tensor, "h w"]:
     """Pixels where no Gaussian of any group lies within a relative `band` of a cutoff, a clamp or a stop.
 
     There the image model jumps, so that rounding may decide either way.

@@ -7,7 +7,7 @@ import pytest
 import torch
 from render_hard_scenes import HARD_SCENES
 from render_scenes import (
-    Splats,
+    RenderScene,
     random_splats,
     relative_error,
     render_with_gradients,
@@ -18,7 +18,7 @@ from torch import Tensor
 from vlgs.types import RasterConfig
 
 
-def assert_agree(splats: Splats, config: RasterConfig | None = None) -> None:
+def assert_agree(splats: RenderScene, config: RasterConfig | None = None) -> None:
     """Float64: equal up to rounding, whatever the scene."""
     got, got_grads = render_with_gradients(splats, "cpu", config)
     want, want_grads = render_with_gradients(splats, "reference", config)
@@ -78,7 +78,7 @@ def test_every_constant_is_respected():
 
 @pytest.mark.parametrize("stop", ["after", "before"])
 @pytest.mark.parametrize("scene", HARD_SCENES)
-def test_hard_scenes(scene: Callable[[], Splats], stop: str):
+def test_hard_scenes(scene: Callable[[], RenderScene], stop: str):
     # Not 1e-4: two layers of alpha 0.99 leave just that, and rounding would decide whether the third is drawn.
     config = RasterConfig(stop=stop, transmittance_min=1.1e-4)  # pyright: ignore[reportArgumentType]
     assert_agree(scene(), config)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from render_hard_scenes import far_off_axis, needles
-from render_scenes import Splats, random_splats, render
+from render_scenes import RenderScene, random_splats, render
 
 from vlgs import ChannelGroup, RasterConfig, rasterize
 
@@ -14,14 +14,14 @@ from vlgs import ChannelGroup, RasterConfig, rasterize
 SMOOTH = RasterConfig(alpha_min=1e-12, transmittance_min=0.0)
 
 
-def few() -> Splats:
+def few() -> RenderScene:
     s = random_splats(5, seed=2, channels=(2, 1))
     return replace(
         s, width=6, height=5, K=torch.tensor([[6.0, 0, 2.5], [0, 7, 3], [0, 0, 1]]).double()
     )
 
 
-def outside_the_clamp() -> Splats:
+def outside_the_clamp() -> RenderScene:
     s = few()
     means = torch.tensor(
         [[5.0, 0.2, 2.0], [-5, 0.1, 2.1], [0.3, 6, 2.2], [-0.2, -6, 2.3], [4, -5, 2.4]]
@@ -30,7 +30,7 @@ def outside_the_clamp() -> Splats:
 
 
 @pytest.mark.parametrize("scene", [few, outside_the_clamp])
-def test_backward_matches_finite_differences(scene: Callable[[], Splats]):
+def test_backward_matches_finite_differences(scene: Callable[[], RenderScene]):
     s = scene()
     inputs = [s.means, s.quats, s.scales, *(w * 0.9 for w in s.weights), *s.values]
 

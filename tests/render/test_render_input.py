@@ -8,14 +8,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from render_scenes import Splats, random_splats, render, render_with_gradients
+from render_scenes import RenderScene, random_splats, render, render_with_gradients
 from torch import Tensor
 
 from vlgs.ops.rasterize import check_camera, check_config, check_tensors, rasterize
 from vlgs.types import Camera, ChannelGroup, RasterConfig
 
 
-def poisoned(splats: Splats, name: str, row: int, value: float) -> Splats:
+def poisoned(splats: RenderScene, name: str, row: int, value: float) -> RenderScene:
     if name in ("means", "quats", "scales"):
         tensor = getattr(splats, name).clone()
         tensor[row, 1] = value

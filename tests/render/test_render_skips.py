@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_scenes import Splats, random_splats, render, render_with_gradients
+from render_scenes import RenderScene, random_splats, render, render_with_gradients
 from torch import Tensor
 
 from vlgs.skips import SKIPS, named
@@ -17,7 +17,7 @@ SAME_BITS = [
 ]
 
 
-def many(channels: tuple[int, ...], dtype: torch.dtype) -> Splats:
+def many(channels: tuple[int, ...], dtype: torch.dtype) -> RenderScene:
     """Long, thin and faint ones among them, which boxes and fixed extents fit badly."""
     return random_splats(400, seed=11, channels=channels, spread=1.2).to(dtype)
 
@@ -54,7 +54,7 @@ def test_a_shared_chain_is_as_many_equal_chains(channels: tuple[int, ...]):
         assert error < 1e-13, name
 
 
-def stack(layers: int, weight: float) -> Splats:
+def stack(layers: int, weight: float) -> RenderScene:
     """Wide Gaussians one behind the other, with values of 1 from the second on: what is left out is seen."""
     one = random_splats(layers, seed=0, channels=(1,))
     means = torch.zeros(layers, 3).double()
@@ -67,7 +67,7 @@ def stack(layers: int, weight: float) -> Splats:
     )  # fmt: skip
 
 
-def lost(splats: Splats, config: RasterConfig) -> float:
+def lost(splats: RenderScene, config: RasterConfig) -> float:
     whole, _ = render(splats, config=replace(config, transmittance_min=0.0))
     early, _ = render(splats, config=config)
     values = max(float(v.abs().max()) for v in splats.values)

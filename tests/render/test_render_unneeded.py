@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_scenes import Splats, random_splats, render
+from render_scenes import RenderScene, random_splats, render
 from torch import Tensor
 
 from vlgs.ops.rasterize import rasterize
@@ -21,7 +21,7 @@ def _loss(out: Rendered, images: tuple[int, ...]) -> Tensor:
     return torch.stack([(upstream[i] * out.images[i]).sum() for i in images]).sum()
 
 
-def _scene(channels: tuple[int, ...]) -> Splats:
+def _scene(channels: tuple[int, ...]) -> RenderScene:
     splats = random_splats(300, seed=4, channels=channels).to(torch.float32)
     # Some weights reach the clamp.
     return replace(splats, weights=tuple(w.sqrt().clamp_min(0.01) for w in splats.weights))

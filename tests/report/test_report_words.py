@@ -13,7 +13,7 @@ from report_fakes import CLASSES, EMBEDDING, NEGATIVES, FakeField, scene, vocabu
 from tiny_runs import TINY, composed
 
 from vlgs.data.export import write_scene
-from vlgs.data.synthetic import Recipe, language_levels
+from vlgs.data.synthetic import SceneSettings, language_levels
 from vlgs.query import LerfRelevancy, VocabSoftmax, encode_questions, words_of
 from vlgs.query.text import VocabularyText
 from vlgs.report.pictures import PictureLimits, write_pictures
@@ -104,8 +104,8 @@ def test_photographs_with_language_and_a_vocabulary_are_asked_by_a_run(
     tmp_path: Path, tiny_scene: Scene
 ):
     drawn, root = tiny_scene, tmp_path / "scene"
-    recipe = Recipe(width=48, height=36, train_views=6, test_views=2, points=400)
-    write_scene(drawn, root, language_levels(recipe))
+    settings = SceneSettings(width=48, height=36, train_views=6, test_views=2, points=400)
+    write_scene(drawn, root, language_levels(settings))
     shutil.rmtree(root / "labels")
     shutil.rmtree(root / "label")
     kept = [entry for entry in TINY if not entry.startswith("data.")]

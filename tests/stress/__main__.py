@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from tests.stress import CASES
-from tests.stress.sheet import FAILED, run_cases, show_table
+from tests.stress.record import FAILED, run_cases, show_table
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,7 +12,7 @@ from tests.fuzz_kernel import fuzz
 from tests.stress.case import Case, Verdict, bound, peak_memory, relative_error
 from tests.stress.splats import (
     SMOOTH,
-    Splats,
+    StressScene,
     full_screen,
     make_splats,
     render,
@@ -21,7 +21,7 @@ from tests.stress.splats import (
     tensors_of,
 )
 from vlgs.ops import project
-from vlgs.ops.blend import blend
+from vlgs.ops.rasterize_to_pixels import rasterize_to_pixels
 from vlgs.types import Camera, ChannelGroup, RasterConfig
 
 
@@ -148,7 +148,7 @@ def crops_with_a_clamp(full: bool) -> Verdict:
     size = torch.tensor([float(side) for side in CROP])
     slack = RasterConfig().fov_margin * size / 2
 
-    def inside(corner: tuple[int, int]) -> Splats:
+    def inside(corner: tuple[int, int]) -> StressScene:
         start = torch.tensor(corner) - slack
         return splats.rows(((pixels > start) & (pixels < start + size + 2 * slack)).all(1))
 
@@ -163,7 +163,7 @@ def crops_with_a_clamp(full: bool) -> Verdict:
 CROP = (47, 37)
 
 
-def _crop_errors(take: Callable[[tuple[int, int]], Splats], config: RasterConfig) -> Verdict:
+def _crop_errors(take: Callable[[tuple[int, int]], StressScene], config: RasterConfig) -> Verdict:
     """Largest difference between a crop and the render of the whole, of the Gaussians that a corner takes."""
     worst = {"float64": 0.0, "float32": 0.0}
     width, height = CROP
@@ -252,7 +252,7 @@ def tight_bounds(full: bool) -> Verdict:
         camera = Camera(torch.eye(4), K, splats.width, splats.height)
         flat = project.project(splats.means, splats.quats, splats.scales, camera, config)
         group = ChannelGroup(torch.eye(batch, dtype=dtype), splats.weights[0])
-        drawn = blend(flat, [group], camera, config).images[0] > 0
+        drawn = rasterize_to_pixels(flat, [group], camera, config).images[0] > 0
         octaves, slack = _exponents(flat, splats.width, splats.height, torch.finfo(dtype).eps)
         limit = torch.log(splats.weights[0].double() / config.alpha_min)
         inside, outside = octaves < limit - slack, octaves > limit + slack

@@ -16,7 +16,7 @@ SMOOTH = RasterConfig(alpha_min=1e-12, transmittance_min=0.0)
 
 
 @dataclass(frozen=True)
-class Splats:
+class StressScene:
     """Gaussians before a camera that stands at the origin and looks along z."""
 
     means: Float[Tensor, "n 3"]
@@ -30,7 +30,7 @@ class Splats:
     center: tuple[float, float] | None = None
     """Principal point in pixels; the middle of the image where it is None."""
 
-    def to(self, dtype: torch.dtype) -> "Splats":
+    def to(self, dtype: torch.dtype) -> "StressScene":
         """The same numbers, rounded."""
         return replace(
             self, means=self.means.to(dtype), quats=self.quats.to(dtype), scales=self.scales.to(dtype),
@@ -38,7 +38,7 @@ class Splats:
             values=tuple(v.to(dtype) for v in self.values),
         )  # fmt: skip
 
-    def rows(self, index: Tensor) -> "Splats":
+    def rows(self, index: Tensor) -> "StressScene":
         """Some of the Gaussians."""
         return replace(
             self, means=self.means[index], quats=self.quats[index], scales=self.scales[index],
@@ -49,7 +49,7 @@ class Splats:
 
 def make_splats(
     n: int, seed: int = 0, size: tuple[int, int] = (61, 45), channels: Sequence[int] = (3, 3)
-) -> Splats:
+) -> StressScene:
     """Ordinary Gaussians at depths 2 to 6, all different in float32 too, a few of them beyond the edges of the image."""
     rng = torch.Generator().manual_seed(seed)
     width, height = size
@@ -62,23 +62,23 @@ def make_splats(
     quats = torch.randn(n, 4, generator=rng)
     weights = tuple(torch.rand(n, generator=rng) for _ in channels)
     values = tuple(torch.randn(n, c, generator=rng) for c in channels)
-    return Splats(means, quats, scales, weights, values, width, height, focal)
+    return StressScene(means, quats, scales, weights, values, width, height, focal)
 
 
-def full_screen(n: int, size: tuple[int, int], channels: int = 1) -> Splats:
+def full_screen(n: int, size: tuple[int, int], channels: int = 1) -> StressScene:
     """Gaussians whose every pixel is within a hundredth of a deviation, at depths 2 to 3."""
     width, height = size
     depth = 2 + torch.arange(n) / max(n, 1)
     means = torch.stack([torch.zeros(n), torch.zeros(n), depth], 1)
     quats = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
-    return Splats(
+    return StressScene(
         means, quats, torch.full((n, 3), 1e3), (torch.full((n,), 0.5),),
         (torch.ones(n, channels),), width, height, 0.9 * width,
     )  # fmt: skip
 
 
 def render(
-    splats: Splats, backend: str = "cpu", config: RasterConfig | None = None
+    splats: StressScene, backend: str = "cpu", config: RasterConfig | None = None
 ) -> tuple[Rendered, dict[str, Tensor]]:
     """Images, and the leaves they depend on by name."""
     leaves = {"means": splats.means, "quats": splats.quats, "scales": splats.scales}
@@ -98,7 +98,7 @@ def render(
 
 
 def render_with_gradients(
-    splats: Splats, backend: str = "cpu", config: RasterConfig | None = None
+    splats: StressScene, backend: str = "cpu", config: RasterConfig | None = None
 ) -> tuple[Rendered, dict[str, Tensor]]:
     """Images, and the gradients of a fixed random linear function of all images and alphas."""
     out, leaves = render(splats, backend, config)

@@ -7,8 +7,8 @@ import pytest
 from tests.stress import CASES, __main__, bits
 from tests.stress.__main__ import main
 from tests.stress.case import CannotRunError, Case, Verdict
-from tests.stress.sheet import FAILED, NOT_RUN, run_cases, show_table
-from vlgs.bench.sheet import read_sheet
+from tests.stress.record import FAILED, NOT_RUN, run_cases, show_table
+from vlgs.bench.record import read_record
 
 SLOW = (
     "N1 poisoned gradients",
@@ -51,7 +51,7 @@ def test_a_failure_and_an_exception_are_failures(tmp_path: Path):
     rows = run_cases([Case("N1 a", fails), Case("N2 b", breaks)], False, path)
     assert [row.outcome for row in rows] == [FAILED, FAILED]
     assert show_table(rows).row_count == 2
-    assert list(read_sheet(path).measured) == ["7 (<= 3)", "RuntimeError: no"]
+    assert list(read_record(path).measured) == ["7 (<= 3)", "RuntimeError: no"]
 
 
 def test_what_the_machine_cannot_run_has_neither_passed_nor_failed(
@@ -61,7 +61,7 @@ def test_what_the_machine_cannot_run_has_neither_passed_nor_failed(
     cases = tuple(case for case in CASES if case.name.endswith((", v4", ", v3")))
     monkeypatch.setattr(__main__, "CASES", cases)
     assert main(["--out", str(tmp_path)]) == 0
-    assert list(read_sheet(tmp_path / "stress.csv").outcome) == [NOT_RUN, NOT_RUN]
+    assert list(read_record(tmp_path / "stress.csv").outcome) == [NOT_RUN, NOT_RUN]
     text = " ".join(capsys.readouterr().out.split())
     assert "N12 threads and repeats, v3: not run, this machine and this build have base" in text
     assert "not run on this machine: 2 of 2 (N12 threads and repeats, v4; N12" in text

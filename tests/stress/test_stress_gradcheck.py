@@ -44,7 +44,7 @@ from vlgs.objectives import Language
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
-from vlgs.ops.cached_weights import FrozenView
+from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
 from vlgs.ops.view_color import view_color
@@ -95,7 +95,7 @@ NO_GRADIENT = {
     )},
     "vlgs.fields.several.SeveralFields.similarity": "training is over",
     "vlgs.fields.splat.ViewRender.detach": "takes the gradient away",
-    "vlgs.ops.blend.weights_alone": "the constants of a FrozenView",
+    "vlgs.ops.rasterize_to_pixels.weights_alone": "the constants of a CachedView",
     "vlgs.ops.cached_weights.Weights.render": "protocol",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
@@ -150,9 +150,9 @@ def shape_alone() -> Check:
 
 
 def frozen() -> Check:
-    """Values alone: everything else of a frozen view is a constant."""
+    """Values alone: everything else of a cached view is a constant."""
     s = make_splats(5, seed=2, size=(6, 5), channels=(2,)).to(torch.float64)
-    kept = FrozenView(s.means, s.quats, s.scales, s.weights[0], view(), SMOOTH)
+    kept = CachedView(s.means, s.quats, s.scales, s.weights[0], view(), SMOOTH)
     return kept.render, [s.values[0]]
 
 
@@ -251,10 +251,10 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.ops.rasterize.rasterize": lambda: rasterizing("cpu", False),
     "vlgs.ops.rasterize.rasterize outside the clamp": lambda: rasterizing("cpu", True),
     "vlgs.ops.rasterize.rasterize shape_grad off": shape_alone,
-    "vlgs.ops.blend.blend": lambda: rasterizing("cpu", False),
+    "vlgs.ops.rasterize_to_pixels.rasterize_to_pixels": lambda: rasterizing("cpu", False),
     "vlgs.ops.project.project": lambda: rasterizing("cpu", True),
     "vlgs.ops.rasterize_reference.rasterize": lambda: rasterizing("reference", False),
-    "vlgs.ops.cached_weights.FrozenView.render": frozen,
+    "vlgs.ops.cached_weights.CachedView.render": frozen,
     "vlgs.fields.splat.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
     "vlgs.fields.splat.SplatModel.gaussians": lambda: model(
         lambda m: tensors(m.gaussians())
@@ -389,7 +389,7 @@ def public_functions(package: str) -> set[str]:
                 returns = str(getattr(function, "__annotations__", {}).get("return", ""))
                 if inspect.isfunction(function) and any(
                     kind in returns
-                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "Splats")
+                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "StressScene")
                 ):
                     found.add(f"{module}.{name}.{member}".rstrip("."))
     return found

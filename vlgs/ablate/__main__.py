@@ -30,7 +30,7 @@ from hydra.errors import HydraException
 from rich.console import Console
 from rich.markup import escape
 
-from vlgs.ablate.job import STOP, Outcome
+from vlgs.ablate.job import STOP, JobOutcome
 from vlgs.ablate.launch import launch
 from vlgs.ablate.plan import PlannedRun, find, plan
 from vlgs.ablate.progress import Count, duration, shown
@@ -132,7 +132,7 @@ class Tally:
     """Name -> why, for runs that are not tried again."""
     lost: Counter[str] = field(default_factory=Counter)
 
-    def add(self, run: PlannedRun, outcome: Outcome) -> None:
+    def add(self, run: PlannedRun, outcome: JobOutcome) -> None:
         """Record the outcome of a run that had no results before. A run that was never started does not count as failed."""
         if outcome.busy or not outcome.log:
             return

@@ -30,7 +30,7 @@ RUN = (sys.executable, "-m", "vlgs.run")
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobOutcome:
     """How far one job is, or how it ended."""
 
     status: int | None = None
@@ -70,12 +70,12 @@ class Outcome:
         return "\n".join([how, *lines, *([f"log: {self.log}"] if self.log else [])])
 
 
-def read_outcome(folder: Path, number: int) -> Outcome:
+def read_outcome(folder: Path, number: int) -> JobOutcome:
     """The last state that the job of that number wrote."""
     try:
-        outcome = Outcome(**json.loads(_record(folder, number).read_text()))
+        outcome = JobOutcome(**json.loads(_record(folder, number).read_text()))
     except FileNotFoundError:
-        return Outcome()
+        return JobOutcome()
     return replace(outcome, log=str(folder / outcome.log))
 
 
@@ -102,7 +102,7 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
     start, stop = time.time(), folder / STOP
 
     def record(status: int | None) -> None:
-        outcome = Outcome(status, time.time() - start, log.name)
+        outcome = JobOutcome(status, time.time() - start, log.name)
         write_atomically(_record(folder, number), json.dumps(asdict(outcome)).encode())
 
     if stop.exists():

@@ -13,7 +13,7 @@ from hydra.core.utils import JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 
-from vlgs.ablate.job import Outcome, read_outcome, run_job
+from vlgs.ablate.job import JobOutcome, read_outcome, run_job
 from vlgs.config import CONF, quote_override
 
 log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ def launch(
     options: Sequence[str],
     folder: Path,
     first: int,
-) -> list[Outcome]:
+) -> list[JobOutcome]:
     """Run every command on the launcher; a failure is an outcome, not an exception.
 
     Args:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlgs.config import quote_override
-from vlgs.identity import Identity
+from vlgs.identity import RunIdentity
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import Table
 
@@ -16,13 +16,13 @@ class PlannedRun:
 
     overrides: tuple[str, ...]
     """Arguments of `python -m vlgs.run`."""
-    identity: Identity
+    identity: RunIdentity
     scene: str
     wanted_by: tuple[str, ...]
     """Rows that it fills, as ``table: row``."""
 
     @property
-    def key(self) -> tuple[Identity, str]:
+    def key(self) -> tuple[RunIdentity, str]:
         """What makes two runs one."""
         return self.identity, self.scene
 
@@ -42,7 +42,7 @@ def plan(
     """
     composer = composer or Composer(benchmark)
     by_scene = composer.takes_scenes()
-    wanted: dict[tuple[Identity, str], tuple[tuple[str, ...], list[str]]] = {}
+    wanted: dict[tuple[RunIdentity, str], tuple[tuple[str, ...], list[str]]] = {}
     for seed in benchmark.seeds:
         for table in tables:
             for row in table.runnable:
@@ -64,7 +64,7 @@ def plan(
     ]
 
 
-def find(runs: Sequence[Mapping[str, Any]]) -> dict[tuple[Identity, str], Mapping[str, Any]]:
+def find(runs: Sequence[Mapping[str, Any]]) -> dict[tuple[RunIdentity, str], Mapping[str, Any]]:
     """Finished runs by `PlannedRun.key`.
 
     Args:
@@ -73,11 +73,11 @@ def find(runs: Sequence[Mapping[str, Any]]) -> dict[tuple[Identity, str], Mappin
     Raises:
         ValueError: If two runs claim the same row, scene and seed: their data differ in content.
     """
-    found: dict[tuple[Identity, str], Mapping[str, Any]] = {}
+    found: dict[tuple[RunIdentity, str], Mapping[str, Any]] = {}
     for run in runs:
         if "recipe" not in run:
             continue  # from before runs said so
-        key = Identity(run["recipe"], run["data_recipe"], run["seed"]), str(run["scene"])
+        key = RunIdentity(run["recipe"], run["data_recipe"], run["seed"]), str(run["scene"])
         if key in found and found[key]["config_hash"] != run["config_hash"]:
             raise ValueError(
                 f"results: runs of one row, scene {key[1]} and seed {key[0].seed} must be one, got "

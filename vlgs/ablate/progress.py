@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.live import Live
 
-from vlgs.ablate.job import Outcome, read_outcome
+from vlgs.ablate.job import JobOutcome, read_outcome
 
 LOOK_SECONDS = 1.0
 
@@ -58,7 +58,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def count(before: Count, outcomes: Sequence[Outcome]) -> Count:
+def count(before: Count, outcomes: Sequence[JobOutcome]) -> Count:
     """State of an ablation from what was known before a launch and what its jobs have written since.
 
     The time of a run is the mean of those of this launch that ended well, else what was known before.
@@ -83,7 +83,7 @@ def shown(console: Console, before: Count, folder: Path, numbers: range) -> Iter
         folder: Where the jobs write.
         numbers: Of the jobs.
     """
-    finished: dict[int, Outcome] = {}
+    finished: dict[int, JobOutcome] = {}
 
     def look() -> Count:
         outcomes = []

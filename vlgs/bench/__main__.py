@@ -157,10 +157,25 @@ def overhead(parser: ArgumentParser) -> Runner:
 
     def run(args: Namespace) -> int:
         from vlgs.bench.overhead import measure_overhead
-        from vlgs.bench.sheet import say
+        from vlgs.bench.record import say
 
         cost = measure_overhead(3 if args.quick else args.iterations)
         say(f"step {cost.step:.2f} ms, around it {cost.around:.2f} ms (medians)")
+        return 0
+
+    return run
+
+
+def seams(parser: ArgumentParser) -> Runner:
+    """What tables of attributes, objectives and the choice of a device add to a step."""
+    parser.add_argument("--turns", type=int, default=20)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.record import say
+        from vlgs.bench.seams import measure_seams
+
+        cost = measure_seams(2 if args.quick else args.turns)
+        say(f"step {cost.step:.2f} ms, of which seams {cost.seams:.3f} ms, {cost.share:.2%} (CPU)")
         return 0
 
     return run
@@ -232,6 +247,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     train,
     unseen,
     overhead,
+    seams,
     iteration,
     reading,
     protocols,

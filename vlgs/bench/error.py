@@ -13,11 +13,11 @@ import torch
 from vlgs.bench.checks import Check, check_dense, check_presets, check_rounding, violated
 from vlgs.bench.clock import Pass, Spread, spreads, take_turns
 from vlgs.bench.memory import Memory, measure_memory
-from vlgs.bench.outcome import Errors, Outcome, compare, outcome, time_render, without_cutoffs
+from vlgs.bench.outcome import Errors, RasterOutcome, compare, outcome, time_render, without_cutoffs
 from vlgs.bench.presets import Trained, raster_presets
 from vlgs.bench.quality import Quality, measure_quality
+from vlgs.bench.record import provenance, say, show, write_record
 from vlgs.bench.scenes import in_precision, save_workload, view_of, with_one_weight
-from vlgs.bench.sheet import provenance, say, show, write_sheet
 from vlgs.bench.steps import StepRow, measure_switches
 from vlgs.bench.switches import RasterSwitch, check_switch, raster_switches, skipped_share
 from vlgs.bench.workload import Workload, make_workload
@@ -127,9 +127,9 @@ def run_error(
         say(f"training steps on {name} ...")
         steps, kept = measure_switches(f"steps {name}", module, threads[0], repeats)
         checks += kept
-        write_sheet(out / "error_steps.csv", steps, header)
-    write_sheet(out / "error.csv", rows, header)
-    write_sheet(out / "error_checks.csv", checks, header)
+        write_record(out / "error_steps.csv", steps, header)
+    write_record(out / "error.csv", rows, header)
+    write_record(out / "error_checks.csv", checks, header)
     _print(rows)
     _print_steps(steps)
     print_checks(checks)
@@ -162,7 +162,7 @@ def _measure(
     }
     samples = take_turns(timed, repeats)
     memory = _memories(copies, variants)
-    truth: dict[RasterConfig, Outcome] = {}
+    truth: dict[RasterConfig, RasterOutcome] = {}
     qualities: dict[RasterConfig, Quality] = {}
     rows = []
     for v in variants:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vlgs.bench.child import free_memory
 from vlgs.bench.clock import Spread, spreads, take_turns
 from vlgs.bench.outcome import time_render
-from vlgs.bench.sheet import (
+from vlgs.bench.record import (
     COLORS,
     STYLE,
     plain_ticks,
@@ -20,7 +20,7 @@ from vlgs.bench.sheet import (
     say,
     show,
     write_figure,
-    write_sheet,
+    write_record,
 )
 from vlgs.bench.workload import make_workload
 from vlgs.types import RasterConfig
@@ -89,7 +89,7 @@ def run_growth(points: Sequence[Point], repeats: int, out: Path, seed: int) -> l
     for axis in dict.fromkeys(point.axis for point in points):
         say(f"{AXES[axis]} ...")
         rows += _measure([p for p in points if p.axis == axis], repeats, seed)
-    write_sheet(out / "growth.csv", rows, header)
+    write_record(out / "growth.csv", rows, header)
     draw_growth(out / "growth", rows)
     _print(rows)
     return rows

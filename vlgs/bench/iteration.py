@@ -16,7 +16,7 @@ from vlgs.bench.clock import replaced
 from vlgs.bench.presets import build, composed
 from vlgs.experiment import construct
 from vlgs.objectives import BlendedView
-from vlgs.ops import attention, blend, project, view_color
+from vlgs.ops import attention, project, rasterize_to_pixels, view_color
 from vlgs.training.lightning import VLGSModule
 
 KERNELS = ("project", "blend", "fusion", "Adam")
@@ -82,7 +82,7 @@ def measure_iteration(size: IterationSize, iterations: int) -> dict[str, float]:
     watch = Stopwatch()
     rows: list[dict[str, float]] = []
     with ExitStack() as patches:
-        module = _module(size)
+        module = make_module(size)
         for index in range(size.views):
             module.views[index]  # as after the first epoch
         for owner, name, part in _timed(module):
@@ -105,7 +105,7 @@ def _timed(module: VLGSModule) -> Iterator[tuple[Any, str, str]]:
     """What is timed, and as which part."""
     functions = {
         "project": project._Project,
-        "blend": blend._Blend,
+        "blend": rasterize_to_pixels._RasterizeToPixels,
         "fusion": attention._Attention,
         "spherical harmonics": view_color._ViewColor,
     }
@@ -161,7 +161,8 @@ def show_iterations(measured: list[tuple[IterationSize, dict[str, float]]]) -> T
     return table
 
 
-def _module(size: IterationSize) -> VLGSModule:
+def make_module(size: IterationSize) -> VLGSModule:
+    """What a run of this size trains, at its start."""
     overrides = [
         *OVERRIDES,
         f"data.train_views={size.views}",

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from vlgs.bench.child import Child, free_memory
 from vlgs.bench.clock import Pass, Spread, spreads, take_turns, time_pass
-from vlgs.bench.sheet import provenance, say, show, write_sheet
+from vlgs.bench.record import provenance, say, show, write_record
 from vlgs.bench.workload import Workload, make_workload
-from vlgs.ops.blend import blend
-from vlgs.ops.machine import instruction_sets, multiply_adds
+from vlgs.ops.machine import instruction_sets, peak_fma
 from vlgs.ops.project import Splats, project
 from vlgs.ops.rasterize import rasterize
+from vlgs.ops.rasterize_to_pixels import rasterize_to_pixels
 from vlgs.types import RasterConfig
 
 ISAS = ("v4", "v3", "base")
@@ -146,7 +146,7 @@ def run_kernel(
         for size in dense_sizes:
             parts = ("call", "reference")
             rows += _measure(children, size, 3, threads, parts, max(3, repeats // 3), seed, rate)
-    write_sheet(out / "kernel.csv", rows, header)
+    write_record(out / "kernel.csv", rows, header)
     _print(rows)
     return rows
 
@@ -227,7 +227,7 @@ def multiply_add_rate() -> float:
     rates: list[float] = []
     for _ in range(15):
         start = thread_time()
-        done = multiply_adds(20_000_000)
+        done = peak_fma(20_000_000)
         rates.append(done / (thread_time() - start) / 1e9)
     return max(rates)
 
@@ -267,7 +267,7 @@ def _blend(w: Workload) -> tuple[Splats, Callable[[], Sequence[Tensor]]]:
     with torch.no_grad():
         splats = project(w.means, w.quats, w.scales, w.camera, config)
     leaves = Splats(splats.mean2d.requires_grad_(), splats.ellipse.requires_grad_(), splats.depth)
-    return leaves, lambda: blend(leaves, w.groups, w.camera, config).images
+    return leaves, lambda: rasterize_to_pixels(leaves, w.groups, w.camera, config).images
 
 
 def _bytes(size: Size, channels: int, dense: bool) -> int:

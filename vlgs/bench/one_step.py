@@ -7,7 +7,7 @@ from time import perf_counter, process_time
 from typing import Any, NamedTuple
 
 from vlgs.bench.clock import Pass
-from vlgs.bench.outcome import Outcome
+from vlgs.bench.outcome import RasterOutcome
 from vlgs.fusion.none import NoFusion
 from vlgs.skips import SKIPS, Skip
 from vlgs.training.build import bind
@@ -36,7 +36,7 @@ class Step(NamedTuple):
     """What a step came to."""
 
     loss: float
-    outcome: Outcome
+    outcome: RasterOutcome
     """Images of the real views, gradients of all parameters."""
     blended: float | None
     """Mean squared error of the blended view; None where none was rendered or the view does not count."""
@@ -108,7 +108,7 @@ def measure_step(module: VLGSModule, step: int) -> Step:
     gradients = {
         name: p.grad.double() for name, p in module.model.named_parameters() if p.grad is not None
     }
-    outcome = Outcome(tuple(image.double() for image in images), gradients)
+    outcome = RasterOutcome(tuple(image.double() for image in images), gradients)
     weight, blended = done.seen.log.get("blend_weight", 0.0), done.terms.get("blended")
     error = blended.item() / weight if blended is not None and weight > 0 else None
     return Step(float(done.total.detach()), outcome, error)

@@ -19,7 +19,7 @@ SMALLEST_ALPHA = 1e-15
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RasterOutcome:
     """Images and the gradients of all leaves, float64 copies."""
 
     images: tuple[Tensor, ...]
@@ -76,17 +76,17 @@ def time_render(w: Workload, config: RasterConfig, threads: int) -> Pass:
 
 def outcome(
     w: Workload, config: RasterConfig, backend: Literal["cpu", "reference"] = "cpu"
-) -> Outcome:
+) -> RasterOutcome:
     """Images and gradients of a workload in its own precision."""
     images = render(w, config, backend)
     gradients = torch.autograd.grad(images, w.leaves(), w.upstream)
-    return Outcome(
+    return RasterOutcome(
         tuple(image.detach().double() for image in images),
         {name: g.double() for name, g in zip(LEAVES, gradients, strict=True)},
     )
 
 
-def compare(got: Outcome, true: Outcome) -> Errors:
+def compare(got: RasterOutcome, true: RasterOutcome) -> Errors:
     """How far one outcome is from another. A gradient that is zero in truth has error 0 if it is zero, else infinity."""
     differences = torch.cat(
         [(a - b).abs().flatten() for a, b in zip(got.images, true.images, strict=True)]

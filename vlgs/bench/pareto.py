@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from vlgs.bench.sheet import COLORS, STYLE, plain_ticks, read_sheet, say, show, write_figure
+from vlgs.bench.record import COLORS, STYLE, plain_ticks, read_record, say, show, write_figure
 from vlgs.files import write_atomically
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def run_pareto(out: Path) -> None:
     Raises:
         FileNotFoundError: If there is no error.csv.
     """
-    table = read_sheet(out / "error.csv")
+    table = read_record(out / "error.csv")
     table["ms"] = table.forward_ms + table.backward_ms
     table["cpu_ms"] = table.forward_cpu + table.backward_cpu
     table["worst_gradient"] = table.filter(like="error_l2_").max(axis=1)

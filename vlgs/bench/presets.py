@@ -8,6 +8,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from vlgs.config import CONF, check_config, check_targets, instantiate
+from vlgs.earlier import as_today
 from vlgs.experiment import Experiment, construct
 from vlgs.known import options
 from vlgs.places import found_again, write_config
@@ -86,7 +87,7 @@ def load_run(path: Path) -> Trained:
     checkpoint = load_checkpoint(folder.checkpoint) if folder.config.is_file() else None
     if checkpoint is None:
         raise ValueError(f"bench: {path} must be a run folder with a checkpoint, got none")
-    config = found_again(path.resolve())
+    config = as_today(found_again(path.resolve()))
     check_targets(config, plugins=())  # a file's word is nobody's trust
     experiment = construct(config)
     scene = experiment.read_scene()

@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 
 from vlgs.bench.child import Child, peak_mib
-from vlgs.bench.sheet import provenance, show, write_sheet
+from vlgs.bench.record import provenance, show, write_record
 from vlgs.metrics.dense import Dense
 from vlgs.metrics.goi import Goi
 from vlgs.metrics.lerf_ovs import LerfOvs
 from vlgs.metrics.masks import Unit
 from vlgs.metrics.ovs3d import Ovs3dArgmax, Ovs3dThreshold
-from vlgs.metrics.protocol import EvaluationProtocol, Evidence, Splats
+from vlgs.metrics.protocol import EvaluationProtocol, Evidence, GaussianEvidence
 from vlgs.metrics.segment import LANGSPLAT_V2
 from vlgs.metrics.select3d import Select3d
 
@@ -59,7 +59,7 @@ def run_protocols(
     for index in range(len(PROTOCOLS)):
         with Child() as child:
             costs.append(child.call(measure, index, queries, levels, size, threads, seed))
-    write_sheet(out / "protocols.csv", costs, header)
+    write_record(out / "protocols.csv", costs, header)
     show(
         f"{queries} queries, {threads} threads",
         ("protocol", "CPU s", "wall s", "CPU ms per query", "peak MiB"),
@@ -117,5 +117,11 @@ def _evidence(levels: int, width: int, height: int, seed: int) -> Evidence:
         return selected.reshape(height, width).to(maps[0].dtype)
 
     return Evidence(
-        "v", names, units, truth.to(torch.uint8), maps, maps, lambda: Splats(gaussians, silhouette)
+        "v",
+        names,
+        units,
+        truth.to(torch.uint8),
+        maps,
+        maps,
+        lambda: GaussianEvidence(gaussians, silhouette),
     )

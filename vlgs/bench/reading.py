@@ -45,7 +45,7 @@ class Reached:
 
 def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> list[Reached]:
     """Write scenes to a scratch folder, train on them for a moment in processes of their own, and write reading.csv."""
-    from vlgs.bench.sheet import provenance, show, write_sheet
+    from vlgs.bench.record import provenance, show, write_record
 
     notes = f"files are in the page cache; photographs and maps of masks repeat after {DISTINCT}"
     header = provenance(seed, note=notes)
@@ -59,7 +59,7 @@ def run_reading(images: int, size: tuple[int, int], out: Path, seed: int) -> lis
             with Child() as child:
                 for stage, *reached in child.call(stages, root, started, Path(scratch) / "heads"):
                     rows.append(Reached(language, images, *size, stage, *reached))
-    write_sheet(out / "reading.csv", rows, header)
+    write_record(out / "reading.csv", rows, header)
     show(
         f"{images} photographs of {size[0]} x {size[1]}",
         ("language, stage", "wall s", "CPU s", "peak MiB"),

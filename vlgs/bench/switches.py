@@ -7,8 +7,8 @@ import torch
 from vlgs.bench.checks import Check, check_bound, check_exact
 from vlgs.bench.outcome import compare, largest_value, outcome
 from vlgs.bench.workload import Workload
-from vlgs.ops.blend import Work, count_work
 from vlgs.ops.project import project
+from vlgs.ops.rasterize_to_pixels import RasterizeWork, count_work
 from vlgs.skips import SKIPS, Skip
 from vlgs.types import RasterConfig
 
@@ -59,7 +59,7 @@ def skipped_share(w: Workload, switch: RasterSwitch) -> float:
     return 1 - done / whole if whole else 0.0
 
 
-def _count(w: Workload, config: RasterConfig) -> Work:
+def _count(w: Workload, config: RasterConfig) -> RasterizeWork:
     with torch.no_grad():
         splats = project(w.means, w.quats, w.scales, w.camera, config)
     return count_work(splats, w.groups, w.camera, config)

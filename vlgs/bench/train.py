@@ -11,16 +11,16 @@ import torch
 
 from vlgs.bench.curve import Curve, CurvePoint, curve_path, evaluated_at, seconds_to
 from vlgs.bench.presets import Trained, build, composed
-from vlgs.bench.sheet import (
+from vlgs.bench.record import (
     COLORS,
     STYLE,
     plain_ticks,
     provenance,
-    read_sheet,
+    read_record,
     say,
     show,
     write_figure,
-    write_sheet,
+    write_record,
 )
 from vlgs.experiment import construct
 from vlgs.runs import RunFolder
@@ -140,7 +140,7 @@ def run_train(
             curve = _curve(label, (*extra, *RECIPES[label]), out, points, threads, seed)
             found[str(curve.scene.iloc[0]), label] = curve
     rows = _summaries(found, targets)
-    write_sheet(out / "train.csv", rows, header)
+    write_record(out / "train.csv", rows, header)
     draw_train(out / "train", found)
     _print(rows)
     return rows
@@ -157,7 +157,7 @@ def _curve(
     path = curve_path(out / "train", scene.name, experiment.run_id(scene.fingerprint))
     if path.is_file():
         say(f"{scene.name}, {label}: {path} is there")
-        return read_sheet(path).assign(label=label)
+        return read_record(path).assign(label=label)
     say(f"{scene.name}, {label}: {iterations} iterations ...")
     header = provenance(seed, overrides=" ".join(overrides), training_threads=threads)
     trained = Trained(experiment, scene, build(experiment, scene))
@@ -166,7 +166,7 @@ def _curve(
         options = FitOptions(meta={}, progress=False, callbacks=[curve])
         if fit(trained.module, RunFolder(Path(folder)), options) is not None:
             raise KeyboardInterrupt
-    write_sheet(path, curve.points, header)
+    write_record(path, curve.points, header)
     return _frame(curve.points)
 
 

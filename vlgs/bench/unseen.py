@@ -13,7 +13,7 @@ import torch
 from vlgs.bench.lonely import share_lonely
 from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.quality import score
-from vlgs.bench.sheet import provenance, read_sheet, say, show, write_sheet
+from vlgs.bench.record import provenance, read_record, say, show, write_record
 from vlgs.bench.unseen_draw import draw_unseen
 from vlgs.bench.unseen_row import UnseenRow
 from vlgs.experiment import construct
@@ -97,7 +97,7 @@ def run_unseen(
                 row = _row(task, label, overrides, seed, threads, {r.run: r for r in rows})
                 if row is not None:
                     rows.append(row)
-                    write_sheet(path, rows, header)
+                    write_record(path, rows, header)
     draw_unseen(out / "unseen", rows)
     _print(rows)
     return rows
@@ -151,7 +151,7 @@ def _middle_tenth(overrides: Sequence[str]) -> list[str]:
 def _read(path: Path) -> list[UnseenRow]:
     if not path.is_file():
         return []
-    table = read_sheet(path).astype(object)
+    table = read_record(path).astype(object)
     lines = table.where(table.notna(), None).to_dict(orient="records")
     return [UnseenRow(**cast(dict[str, Any], line)) for line in lines]
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vlgs.bench.sheet import COLORS, STYLE, write_figure
+from vlgs.bench.record import COLORS, STYLE, write_figure
 from vlgs.bench.unseen_row import UnseenRow
 
 if TYPE_CHECKING:

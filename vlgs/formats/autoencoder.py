@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vlgs.formats.plain import load_plain, save_plain
+from vlgs.heads import FittedHead
 from vlgs.heads.autoencoder import Autoencoder
 
 
@@ -49,7 +50,7 @@ def read_autoencoder(path: str | Path) -> Autoencoder:
     return head
 
 
-def load_weights(head: Autoencoder, path: str | Path) -> None:
+def load_weights(head: FittedHead, path: str | Path) -> None:
     """Give a head the weights of a file, in place of a fit.
 
     Raises:

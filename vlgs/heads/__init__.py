@@ -1,6 +1,7 @@
 """Heads: what stands between the short code that a Gaussian carries and an image-text embedding."""
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -39,4 +40,28 @@ class Head(Protocol):
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """Unit embeddings of codes, which may be blends of several."""
+        ...
+
+
+@runtime_checkable
+class FittedHead(Head, Protocol):
+    """A head whose fit takes steps, or is read from a file that another program wrote."""
+
+    weights: str | None
+    """File of weights that take the place of a fit (`vlgs.formats.load_weights`); None: it is fitted."""
+    encoder_widths: tuple[int, ...]
+    """Hidden widths from the embedding to the code."""
+    decoder_widths: tuple[int, ...]
+    """Hidden widths from the code to the embedding."""
+
+    def rehearse(self, steps: int) -> None:
+        """Take at most so many steps in `fit`, and keep nothing on disk."""
+        ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> object:
+        """Take weights in the place of a fit."""
+        ...
+
+    def requires_grad_(self, requires_grad: bool = True) -> object:
+        """Say whether the weights are trained."""
         ...

@@ -5,7 +5,7 @@ import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
@@ -157,6 +157,11 @@ class Autoencoder(nn.Module):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(path, _to_cache(self.state_dict()))
         self.requires_grad_(False)
+
+    def rehearse(self, steps: int) -> None:
+        """See `vlgs.heads.FittedHead`."""
+        steps = min(steps, self.fit_settings.steps)
+        self.fit_settings, self.cache_dir = replace(self.fit_settings, steps=steps), None
 
     def encode(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m d"]:
         """Codes of unit length.

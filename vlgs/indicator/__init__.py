@@ -38,6 +38,8 @@ class PerLevel:
     """A learned indicator of its own for every mask level (``levels=joint``)."""
 
     demands: ClassVar[Sequence[Demand]] = (Demand("indicator=per_level", "levels", "joint"),)
+    each_level: ClassVar[bool] = True
+    """A Gaussian has a parameter for every mask level."""
     without_color: ClassVar[bool] = True
     """It blends Gaussians that have no colour."""
 

@@ -12,7 +12,7 @@ from vlgs.metrics.masks import QueryScore, Unit, by_category, mean_over_queries,
 
 
 @dataclass(frozen=True)
-class Splats:
+class GaussianEvidence:
     """The scene in 3D, for protocols that select Gaussians instead of pixels."""
 
     relevancy: Sequence[Float[Tensor, "k n"]]
@@ -35,7 +35,7 @@ class Evidence:
     """Of every class."""
     relevancy: Sequence[Float[Tensor, "k h w"]]
     """Of every class under the query."""
-    splats: Callable[[], Splats] | None = None
+    splats: Callable[[], GaussianEvidence] | None = None
     """Computed when a protocol asks for it; None where the scene is no Gaussians."""
 
     def levels(self, maps: Sequence[Float[Tensor, "k h w"]], unit: Unit) -> Float[Tensor, "l h w"]:

@@ -13,15 +13,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
-from vlgs.ops.blend import weights_alone
 from vlgs.ops.device import Kernels
 from vlgs.ops.project import Splats, project
+from vlgs.ops.rasterize_to_pixels import weights_alone
 from vlgs.types import Camera, RasterConfig
 
 DEFAULT_BUDGET = 2 << 30
 
 
-class FrozenBudgetError(ValueError):
+class CacheBudgetError(ValueError):
     """The weights of a view do not fit."""
 
 
@@ -42,7 +42,7 @@ class Weights(Protocol):
         ...
 
 
-class Frozen(NamedTuple):
+class ViewWeights(NamedTuple):
     """What a device makes of a view."""
 
     weights: Weights
@@ -50,7 +50,7 @@ class Frozen(NamedTuple):
     visible: Bool[Tensor, " n"]
 
 
-class FrozenView:
+class CachedView:
     """The blending weights of one view.
 
     Args:
@@ -63,7 +63,7 @@ class FrozenView:
         budget: Bytes that the weights may take: 76 per block of 4x4 pixels and Gaussian in float32.
 
     Raises:
-        FrozenBudgetError: If they would take more, before they are allocated.
+        CacheBudgetError: If they would take more, before they are allocated.
         ValueError: If an input is not finite, a weight is not in [0, 1], or there is not one for each Gaussian.
     """
 
@@ -80,13 +80,13 @@ class FrozenView:
     ) -> None:
         if len(weight) != len(means):
             raise ValueError(
-                f"frozen view: weight must be [{len(means)}], got {list(weight.shape)}"
+                f"cached view: weight must be [{len(means)}], got {list(weight.shape)}"
             )
         splats = project(means, quats, scales, camera, config)
         made = KERNELS.of(means)(splats, weight, camera, config)
         if made.weights.nbytes > budget:
-            raise FrozenBudgetError(
-                f"frozen view: weights must be within {budget} bytes, got {made.weights.nbytes}"
+            raise CacheBudgetError(
+                f"cached view: weights must be within {budget} bytes, got {made.weights.nbytes}"
             )
         made.weights.keep()
         self._weights = made.weights
@@ -110,10 +110,10 @@ class FrozenView:
 
 
 class _CpuWeights:
-    """csrc/frozen.cpp."""
+    """csrc/cached_weights.cpp."""
 
     def __init__(self, picture: Any, dtype: torch.dtype, size: tuple[int, int]) -> None:
-        kind = _csrc.FrozenFloat if dtype == torch.float32 else _csrc.FrozenDouble
+        kind = _csrc.CachedWeightsFloat if dtype == torch.float32 else _csrc.CachedWeightsDouble
         self._picture: Any = picture
         self._weights = kind(picture, torch.get_num_threads())
         self._size = size
@@ -135,7 +135,7 @@ class _Product(torch.autograd.Function):
     def forward(
         ctx: Any,
         values: Tensor,
-        weights: _csrc.FrozenFloat | _csrc.FrozenDouble,
+        weights: _csrc.CachedWeightsFloat | _csrc.CachedWeightsDouble,
         size: tuple[int, int],
     ):
         values = values.contiguous()
@@ -153,10 +153,10 @@ class _Product(torch.autograd.Function):
         return d_values, None, None
 
 
-def _on_cpu(splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig) -> Frozen:
+def _on_cpu(splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig) -> ViewWeights:
     picture, visible, alpha = weights_alone(splats, weight, camera, config)
     weights = _CpuWeights(picture, weight.dtype, (camera.height, camera.width))
-    return Frozen(weights, alpha, visible)
+    return ViewWeights(weights, alpha, visible)
 
 
-KERNELS = Kernels("frozen", cpu=_on_cpu)
+KERNELS = Kernels("cached_weights", cpu=_on_cpu)

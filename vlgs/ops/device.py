@@ -22,7 +22,7 @@ class Kernels(Generic[Kernel]):
         cpu: What computes it on the CPU.
 
     Example:
-        >>> Kernels("blend", cpu=len).of(torch.zeros(3))
+        >>> Kernels("rasterize_to_pixels", cpu=len).of(torch.zeros(3))
         <built-in function len>
     """
 

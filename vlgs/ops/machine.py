@@ -13,6 +13,6 @@ def instruction_sets() -> list[str]:
     return _csrc.isas().split()
 
 
-def multiply_adds(packs: int) -> int:
+def peak_fma(packs: int) -> int:
     """Do at least so many multiply-adds of sixteen floats and nothing else; returns how many were done."""
-    return _csrc.multiply_adds(packs)
+    return _csrc.peak_fma(packs)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.ops.blend import blend
 from vlgs.ops.project import Splats, project
+from vlgs.ops.rasterize_to_pixels import rasterize_to_pixels
 from vlgs.types import Camera, ChannelGroup, Covariance, RasterConfig, Rendered
 
 DEFAULT = RasterConfig()
@@ -89,7 +89,7 @@ def _rasterize(
     """Project and blend; groups with a shape of their own in passes of their own."""
     splats = project(means, quats, scales, camera, config)
     if all(group.shape is None for group in groups):
-        return blend(splats, groups, camera, config)
+        return rasterize_to_pixels(splats, groups, camera, config)
     images: list[Tensor] = [splats.mean2d] * len(groups)
     alphas, visible = list(images), torch.zeros(len(means), dtype=torch.bool)
     by_shape: dict[int, list[int]] = {}
@@ -97,7 +97,7 @@ def _rasterize(
         by_shape.setdefault(id(group.shape), []).append(index)
     for indices in by_shape.values():
         own = _reshaped(splats, means, groups[indices[0]].shape, camera, config)
-        part = blend(own, [groups[i] for i in indices], camera, config)
+        part = rasterize_to_pixels(own, [groups[i] for i in indices], camera, config)
         for index, image, alpha in zip(indices, part.images, part.alphas, strict=True):
             images[index], alphas[index] = image, alpha
         visible |= part.visible

@@ -16,8 +16,8 @@ from vlgs.metrics.protocol import (
     EvaluationProtocol,
     Evidence,
     Figures,
+    GaussianEvidence,
     NotScorableError,
-    Splats,
 )
 from vlgs.query import Prompts, Query
 from vlgs.report.answer import Answer
@@ -67,7 +67,7 @@ class LanguageTally:
         self,
         view: View,
         answer: Answer,
-        splats: Callable[[], Splats] | None = None,
+        splats: Callable[[], GaussianEvidence] | None = None,
     ) -> None:
         """Score one view against its labels; a view without labels adds nothing.
 

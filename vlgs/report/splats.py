@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vlgs.fields import HasGaussians
-from vlgs.metrics.protocol import Splats
+from vlgs.metrics.protocol import GaussianEvidence
 from vlgs.query import Prompts, Query
 from vlgs.types import Camera
 
@@ -32,7 +32,7 @@ class SplatAnswers:
         """Of each class for each Gaussian, per level."""
         return [self._ask(level) for level in self.levels]
 
-    def seen_by(self, camera: Camera) -> Splats:
+    def seen_by(self, camera: Camera) -> GaussianEvidence:
         """Relevancy, and silhouettes from a camera: selected Gaussians keep what blends language, all others weigh 0."""
 
         def silhouette(level: int, selected: Bool[Tensor, " n"]) -> Float[Tensor, "h w"]:
@@ -41,7 +41,7 @@ class SplatAnswers:
             values = torch.ones(len(selected), 1, dtype=weight.dtype)
             return gaussians.render_values(camera, values, weight)[..., 0]
 
-        return Splats(self.relevancy, silhouette)
+        return GaussianEvidence(self.relevancy, silhouette)
 
     def _ask(self, level: HasGaussians) -> Float[Tensor, "k n"]:
         words = torch.cat([self.prompts.text, self.prompts.negatives])

@@ -19,7 +19,7 @@ from vlgs.identity import (
     MOVES_NOTHING,
     PLACES,
     RESULTS_VERSION,
-    Identity,
+    RunIdentity,
     identity,
     moves,
 )
@@ -137,7 +137,7 @@ class Composer:
         self._rows = _read_rows(file, self._head)
         self._composed = False
 
-    def identity(self, overrides: Sequence[str], seed: int) -> Identity:
+    def identity(self, overrides: Sequence[str], seed: int) -> RunIdentity:
         """Recipe of a row on this benchmark.
 
         Raises:
@@ -157,7 +157,7 @@ class Composer:
         known = self._rows[key]
         if "refused" in known:
             raise UnknownOptionError(known["refused"])
-        return Identity(**known, seed=seed)
+        return RunIdentity(**known, seed=seed)
 
     def require_sound(self, source: Path) -> None:
         """Do nothing if the configuration has the options of the benchmark itself.

@@ -27,7 +27,7 @@ _FIRST = "augment"
 
 
 @dataclass(frozen=True)
-class Shot:
+class AddedView:
     """A view that nobody photographed."""
 
     number: int
@@ -126,22 +126,22 @@ class Offline:
             seed: Of the cameras.
             folder: Where an extractor's maps are kept, all levels of a view in one file: they are dear.
         """
-        shots = self._shoot(next(iter(scenes.values())), model, seed)
+        views = self._render(next(iter(scenes.values())), model, seed)
         extended = {}
         for level, scene in scenes.items():
-            maps = [self._describe(scene, shot, level, folder) for shot in shots]
-            extended[level] = _with_views(scene, shots, maps)
+            maps = [self._describe(scene, added, level, folder) for added in views]
+            extended[level] = _with_views(scene, views, maps)
         return extended
 
     @torch.no_grad()
-    def _shoot(self, scene: Scene, model: SplatModel, seed: int) -> list[Shot]:
+    def _render(self, scene: Scene, model: SplatModel, seed: int) -> list[AddedView]:
         cameras = [view.camera for view in scene.train]
         near = nearest_views(cameras, self.neighbours if self.pairs == "neighbours" else None)
         with_others = [index for index, others in enumerate(near) if others]
         if not with_others:
             raise ValueError("augment: two training views must have one image size, got none")
         rng, between, fused = np.random.default_rng([seed, _CAMERAS]), UniformBlend(), model.fuse()
-        shots = []
+        views = []
         for number in range(self.views):
             first = with_others[number * len(with_others) // self.views % len(with_others)]
             second = near[first][int(rng.integers(len(near[first])))]
@@ -149,20 +149,20 @@ class Offline:
             color = model.render(camera, language=False, fused=fused).color
             assert color is not None  # it was asked for
             image = (color.clamp(0, 1) * 255).round().to(torch.uint8)
-            shots.append(Shot(number, camera, image))
-        return shots
+            views.append(AddedView(number, camera, image))
+        return views
 
     def _describe(
-        self, scene: Scene, shot: Shot, level: int | None, folder: Path
+        self, scene: Scene, added: AddedView, level: int | None, folder: Path
     ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]] | None:
         if len(scene.mask_vectors) == 0:
             return None
         if self.extractor is None:
             assert scene.supervise is not None  # `require`
-            return scene.supervise(shot.camera, shot.number)
-        path = folder / f"{_name(shot)}.npz"
+            return scene.supervise(added.camera, added.number)
+        path = folder / f"{_name(added)}.npz"
         if not path.is_file():
-            found, stream = self.extractor(shot.image.numpy(), _name(shot)), io.BytesIO()
+            found, stream = self.extractor(added.image.numpy(), _name(added)), io.BytesIO()
             np.savez(stream, ids=found.ids, vectors=found.vectors)
             folder.mkdir(parents=True, exist_ok=True)
             write_atomically(path, stream.getvalue())
@@ -192,12 +192,12 @@ class RenderViews:
 
 def _with_views(
     scene: Scene,
-    shots: Sequence[Shot],
+    added: Sequence[AddedView],
     maps: Sequence[tuple[Int[Tensor, "_ _"], Float[Tensor, "_ e"]] | None],
 ) -> Scene:
     views, vectors, areas = list(scene.train), [scene.mask_vectors], [scene.mask_areas]
     offset = len(scene.mask_vectors)
-    for shot, described in zip(shots, maps, strict=True):
+    for view, described in zip(added, maps, strict=True):
         masks = None
         if described is not None:
             index, own = described
@@ -205,7 +205,7 @@ def _with_views(
             offset += len(own)
             vectors.append(own.to(scene.mask_vectors.dtype))
             areas.append(torch.bincount(index[index >= 0].long(), minlength=len(own)).float())
-        views.append(_view(shot, masks))
+        views.append(_view(view, masks))
     return replace(
         scene,
         train=tuple(views),
@@ -214,14 +214,14 @@ def _with_views(
     )
 
 
-def _view(shot: Shot, masks: Int[Tensor, "h w"] | None) -> View:
+def _view(added: AddedView, masks: Int[Tensor, "h w"] | None) -> View:
     return View(
-        name=_name(shot),
-        camera=shot.camera,
-        read_image=shot.image.clone,
+        name=_name(added),
+        camera=added.camera,
+        read_image=added.image.clone,
         read_masks=None if masks is None else masks.clone,
     )
 
 
-def _name(shot: Shot) -> str:
-    return f"extra_{shot.number + 1:05d}"
+def _name(added: AddedView) -> str:
+    return f"extra_{added.number + 1:05d}"

@@ -15,9 +15,8 @@ from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
 from vlgs.gaussians.background import with_background
-from vlgs.heads import Head
-from vlgs.heads.autoencoder import Autoencoder
-from vlgs.indicator import Indicator, PerLevel
+from vlgs.heads import FittedHead, Head
+from vlgs.indicator import Indicator
 from vlgs.objectives import Objective, Setup
 from vlgs.objectives.targets import TrainingViews
 from vlgs.skip_count import SkipCount
@@ -93,7 +92,7 @@ def build_module(
         raise ValueError(f"train: training views of {scene.name} must be at least 1, got 0")
     fusion, head, config = parts.fusion, parts.head, parts.gaussians
     if scene.mask_vectors.shape[0] > 0:
-        if isinstance(head, Autoencoder) and head.weights is not None:
+        if isinstance(head, FittedHead) and head.weights is not None:
             load_weights(head, head.weights)
         else:
             head.fit(scene.mask_vectors, scene.mask_areas)
@@ -105,7 +104,7 @@ def build_module(
     width = head.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.own_shape
-    several = isinstance(parts.indicator, PerLevel) and scene.mask_levels > 1
+    several = has(parts.indicator, "each_level") and scene.mask_levels > 1
     levels = scene.mask_levels if several else None
     attributes = attributes_of(config, width, levels, own, asdict(parts.trainer.learning_rates))
     if start is not None:

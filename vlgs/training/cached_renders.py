@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.fields.cached_weights import FrozenViews
+from vlgs.fields.cached_weights import CachedViews
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
-from vlgs.ops.cached_weights import FrozenView
+from vlgs.ops.cached_weights import CachedView
 from vlgs.skip_count import SkipCount
 from vlgs.types import Camera, Covariance
 
@@ -40,7 +40,7 @@ def has_frozen_shape(model: SplatModel) -> bool:
     return not any(model.splats[name].requires_grad for name in rows)
 
 
-class FrozenRenders:
+class CachedRenders:
     """Renders the training views from kept blending weights, as far as these are constant.
 
     Args:
@@ -51,7 +51,7 @@ class FrozenRenders:
 
     def __init__(self, model: SplatModel, budget: int, counts: SkipCount) -> None:
         self.model = model
-        self.views = FrozenViews(budget)
+        self.views = CachedViews(budget)
         self.counts = counts
         self._colors: dict[int, Tensor] = {}
 
@@ -94,7 +94,7 @@ class FrozenRenders:
         weight: Float[Tensor, " n"],
         shape: Covariance,
         fused: FusedGaussians,
-    ) -> FrozenView | None:
+    ) -> CachedView | None:
         view = self.views.get(name)
         if view is not None:
             self.counts.skip("frozen_weights")
@@ -113,7 +113,7 @@ class FrozenRenders:
             )
 
     def _color(
-        self, index: int, camera: Camera, view: FrozenView, fused: FusedGaussians
+        self, index: int, camera: Camera, view: CachedView, fused: FusedGaussians
     ) -> Float[Tensor, "h w 3"]:
         """The colour image; kept too where nothing that it depends on is trained."""
         if index in self._colors:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
-from vlgs.config import LEVELS
+from vlgs.config import CODES, LEVELS
 from vlgs.training.joint import join_levels
 from vlgs.training.stages import Progress, Stage, Stages
 from vlgs.training.workshop import Workshop
@@ -30,7 +30,7 @@ class Single:
     """One mask level."""
 
     read: Sequence[int] = ()
-    codes: int = 1
+    codes: int = CODES["single"]
 
     def stages(self, language: bool) -> Sequence[Stage]:
         """None."""
@@ -42,7 +42,7 @@ class Separate:
     """A model for each mask level; stages go through them by themselves."""
 
     read: Sequence[int] = LEVELS
-    codes: int = 1
+    codes: int = CODES["separate"]
 
     def stages(self, language: bool) -> Sequence[Stage]:
         """None."""
@@ -56,7 +56,7 @@ class Joint:
     joint: ClassVar[bool] = True
     """A model has something of its own for each level."""
     read: Sequence[int] = LEVELS
-    codes: int = len(LEVELS)
+    codes: int = CODES["joint"]
 
     def stages(self, language: bool) -> Sequence[Stage]:
         """See `vlgs.training.stages.Stages`."""

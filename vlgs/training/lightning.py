@@ -13,7 +13,7 @@ from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.gaussians.ply import SH_COEFFICIENTS
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
-from vlgs.training.cached_renders import FrozenRenders, freeze, has_frozen_shape
+from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
 from vlgs.training.exposure import Exposure
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
@@ -78,7 +78,7 @@ class VLGSModule(L.LightningModule):
             setup,
             config.densify_on == "rgb",
             Exposure(len(viewmats)) if settings.exposure and color else None,
-            FrozenRenders(model, settings.skip.frozen_budget, setup.counts)
+            CachedRenders(model, settings.skip.frozen_budget, setup.counts)
             if keeps and has_frozen_shape(model)
             else None,
         )

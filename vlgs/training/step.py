@@ -15,7 +15,7 @@ from vlgs.losses import masked_mse
 from vlgs.objectives import Setup, StepView
 from vlgs.objectives.objective import all_needs
 from vlgs.objectives.targets import Target
-from vlgs.training.cached_renders import FrozenRenders
+from vlgs.training.cached_renders import CachedRenders
 from vlgs.training.exposure import Exposure
 
 COLOR = frozenset({"color"})
@@ -73,7 +73,7 @@ class TrainingStep:
     setup: Setup
     densify_on_color: bool
     exposure: Exposure | None
-    frozen: FrozenRenders | None
+    frozen: CachedRenders | None
 
     @cached_property
     def needs(self) -> frozenset[str]:

@@ -36,7 +36,7 @@ mechanism; numbers compare with each other and with nothing that was measured on
 """
 
 from vlgs.data.synthetic.masks import NO_NOISE, LabelNoise, LevelMasks
-from vlgs.data.synthetic.recipe import Recipe
 from vlgs.data.synthetic.scene import language_levels, load_scene
+from vlgs.data.synthetic.settings import SceneSettings
 
-__all__ = ["NO_NOISE", "LabelNoise", "LevelMasks", "Recipe", "language_levels", "load_scene"]
+__all__ = ["NO_NOISE", "LabelNoise", "LevelMasks", "SceneSettings", "language_levels", "load_scene"]

@@ -12,8 +12,8 @@ from jaxtyping import Int
 from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
 from vlgs.data.synthetic.layouts import build
 from vlgs.data.synthetic.masks import NO_NOISE, Region
-from vlgs.data.synthetic.photographs import Photograph, photograph
-from vlgs.data.synthetic.recipe import Recipe
+from vlgs.data.synthetic.photographs import TracedImage, photograph
+from vlgs.data.synthetic.settings import SceneSettings
 from vlgs.data.synthetic.world import World
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.files import write_atomically
@@ -33,7 +33,7 @@ class Shot:
     number: int
     """Among the training views, or among the held-out ones."""
     camera: Camera
-    photo: Photograph
+    photo: TracedImage
 
 
 @dataclass(frozen=True)
@@ -47,63 +47,68 @@ class Capture:
     test: tuple[Shot, ...]
 
 
-def open_capture(recipe: Recipe, cache: Path | None = None) -> Capture:
+def open_capture(settings: SceneSettings, cache: Path | None = None) -> Capture:
     """Build and photograph, or find the photographs; sweeps over levels, faults and methods ask for the same ones again.
 
     Args:
-        recipe: Of the scene; its points and faults do not matter here.
+        settings: Of the scene; its points and faults do not matter here.
         cache: Folder that keeps photographs between processes; None: they are kept in memory only.
     """
-    return _open(replace(recipe, points=0, faults=NO_NOISE), cache)
+    return _open(replace(settings, points=0, faults=NO_NOISE), cache)
 
 
 @functools.lru_cache(maxsize=2)
-def _open(recipe: Recipe, cache: Path | None) -> Capture:
-    things = build(recipe.scene, recipe.difficulty, np.random.default_rng([_LAYOUT, recipe.seed]))
+def _open(settings: SceneSettings, cache: Path | None) -> Capture:
+    things = build(
+        settings.scene, settings.difficulty, np.random.default_rng([_LAYOUT, settings.seed])
+    )
     world = World(things)
     classes = tuple(dict.fromkeys(thing.name for thing in things if thing.masked))
     class_of_thing = np.array(
         [classes.index(thing.name) if thing.masked else IGNORE_ID for thing in things], np.uint8
     )
-    train, test = moments(recipe.train_views, recipe.test_views)
+    train, test = moments(settings.train_views, settings.test_views)
     order = np.argsort(np.argsort(np.concatenate([train, test])))
     places = []
     for position, moment in zip(
         order.tolist(), np.concatenate([train, test]).tolist(), strict=True
     ):
-        held_out = len(places) >= recipe.train_views
-        number = len(places) - recipe.train_views * held_out
-        rng = np.random.default_rng([_WALK, recipe.seed, int(held_out), number])
-        if not recipe.scene.outdoors:
-            camera = camera_at(moment, rng, recipe.width, recipe.height)
+        held_out = len(places) >= settings.train_views
+        number = len(places) - settings.train_views * held_out
+        rng = np.random.default_rng([_WALK, settings.seed, int(held_out), number])
+        if not settings.scene.outdoors:
+            camera = camera_at(moment, rng, settings.width, settings.height)
         else:
             stop = stop_at(
-                recipe.scene.stage, number, recipe.train_views, recipe.test_views if held_out else 0
+                settings.scene.stage,
+                number,
+                settings.train_views,
+                settings.test_views if held_out else 0,
             )
-            camera = held(stop, rng, recipe.width, recipe.height)
+            camera = held(stop, rng, settings.width, settings.height)
         places.append((f"frame_{position + 1:05d}", number, camera))
-    photos = _photographs(world, [camera for *_, camera in places], recipe, cache)
+    photos = _photographs(world, [camera for *_, camera in places], settings, cache)
     shots = [Shot(n, k, c, photo) for (n, k, c), photo in zip(places, photos, strict=True)]
     return Capture(
         world,
         classes,
         class_of_thing[world.thing_of_part],
-        tuple(shots[: recipe.train_views]),
-        tuple(shots[recipe.train_views :]),
+        tuple(shots[: settings.train_views]),
+        tuple(shots[settings.train_views :]),
     )
 
 
 def _photographs(
-    world: World, cameras: list[Camera], recipe: Recipe, cache: Path | None
-) -> list[Photograph]:
+    world: World, cameras: list[Camera], settings: SceneSettings, cache: Path | None
+) -> list[TracedImage]:
     if cache is None:
         return [photograph(world, camera) for camera in cameras]
-    file = cache / f"capture-{recipe.fingerprint(level=0)}.npz"
-    names = [field.name for field in fields(Photograph)]
+    file = cache / f"capture-{settings.fingerprint(level=0)}.npz"
+    names = [field.name for field in fields(TracedImage)]
     try:
         with Archive(file, "photographs of the scene") as kept:
             stacks = [kept.read(name, "fiub") for name in names]
-        return [Photograph(*arrays) for arrays in zip(*stacks, strict=True)]
+        return [TracedImage(*arrays) for arrays in zip(*stacks, strict=True)]
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:
@@ -118,7 +123,7 @@ def _photographs(
 
 
 def regions(
-    world: World, photo: Photograph
+    world: World, photo: TracedImage
 ) -> tuple[dict[int, Int[np.ndarray, "h w"]], dict[int, dict[int, Region]]]:
     """Region number per pixel, and what the regions are, at levels 1 (subpart), 2 (part) and 3 (whole)."""
     part = photo.part.astype(np.int64)

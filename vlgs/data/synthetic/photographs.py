@@ -16,7 +16,7 @@ _TURNED_SQUARE = np.array([[-1, -3], [3, -1], [1, 3], [-3, 1]]).T / 8
 
 
 @dataclass(frozen=True)
-class Photograph:
+class TracedImage:
     """One image with its ground truth."""
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -39,7 +39,7 @@ def pixel_rays(
     return camera_center(pose).numpy()[:, None], direction
 
 
-def photograph(world: World, camera: Camera) -> Photograph:
+def photograph(world: World, camera: Camera) -> TracedImage:
     """Trace one ray per pixel, then four more for every pixel that differs from a neighbour.
 
     Edges are smooth that way, and flat areas cost one ray. Labels are those of the pixel's centre and never averaged.
@@ -56,7 +56,7 @@ def photograph(world: World, camera: Camera) -> Photograph:
     color[:, rough] = (color[:, rough] + more) / (1 + dx.size)
     image = np.round(color.T * 255).astype(np.uint8)
     shape = (height, width)
-    return Photograph(
+    return TracedImage(
         image.reshape(*shape, 3),
         seen.first.part.reshape(shape),
         seen.patch.reshape(shape),

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vlgs.data.synthetic.photographs import Photograph, pixel_rays
+from vlgs.data.synthetic.photographs import TracedImage, pixel_rays
 from vlgs.data.synthetic.world import World
 from vlgs.types import Camera
 
@@ -16,7 +16,7 @@ _OUTLIERS = 0.01  # share of points that lie anywhere along their ray
 
 
 def view_points(
-    world: World, camera: Camera, photo: Photograph, count: int, rng: np.random.Generator
+    world: World, camera: Camera, photo: TracedImage, count: int, rng: np.random.Generator
 ) -> tuple[Float[Tensor, "p 3"], UInt8[Tensor, "p 3"]]:
     """At most `count` points seen by one view, in world units, with the colours of their pixels."""
     pixels = rng.integers(0, photo.part.size, count)

@@ -13,10 +13,10 @@ from vlgs.data.synthetic.capture import Capture, Shot, open_capture, regions
 from vlgs.data.synthetic.labels import dense_labels, object_labels
 from vlgs.data.synthetic.language import vocabulary
 from vlgs.data.synthetic.masks import LabelNoise, LevelMasks, view_masks
-from vlgs.data.synthetic.photographs import Photograph, photograph
+from vlgs.data.synthetic.photographs import TracedImage, photograph
 from vlgs.data.synthetic.points import view_points
-from vlgs.data.synthetic.recipe import MAX_VIEWS, Recipe
 from vlgs.data.synthetic.scene_file import find_scene
+from vlgs.data.synthetic.settings import MAX_VIEWS, SceneSettings
 from vlgs.types import Camera, Scene, View
 
 _POINTS = 102  # purpose of draws
@@ -60,11 +60,13 @@ def load_scene(
     if level not in range(4):
         raise ValueError(f"synthetic: level must be 0, 1, 2 or 3, got {level}")
     file = find_scene(scene)
-    recipe = Recipe(file, difficulty, width, height, train_views, test_views, seed, points, faults)
+    settings = SceneSettings(
+        file, difficulty, width, height, train_views, test_views, seed, points, faults
+    )
     folder = None if cache is None else Path(cache)
-    capture = open_capture(recipe, folder)
+    capture = open_capture(settings, folder)
     indices, vectors, offset = {}, [], 0
-    for name, levels in language_levels(recipe, folder).items():
+    for name, levels in language_levels(settings, folder).items():
         masks = levels[level]
         indices[name] = np.where(masks.index >= 0, masks.index + offset, -1).astype(np.int32)
         vectors.append(masks.vectors)
@@ -73,7 +75,7 @@ def load_scene(
     for index in indices.values():
         areas += np.bincount(index[index >= 0], minlength=offset)
     cloud = [
-        view_points(capture.world, shot.camera, shot.photo, count, _draws(recipe, shot))
+        view_points(capture.world, shot.camera, shot.photo, count, _draws(settings, shot))
         for shot, count in zip(capture.train, _shares(points, train_views), strict=True)
     ]
     return Scene(
@@ -88,37 +90,43 @@ def load_scene(
         classes=capture.classes,
         class_kinds={thing.name: thing.kind for thing in capture.world.things if thing.masked},
         vocabulary=vocabulary(capture.classes),
-        supervise=lambda camera, number: _supervise(recipe, folder, level, camera, number),
-        fingerprint=recipe.fingerprint(level),
+        supervise=lambda camera, number: _supervise(settings, folder, level, camera, number),
+        fingerprint=settings.fingerprint(level),
     )
 
 
 def language_levels(
-    recipe: Recipe, cache: Path | None = None
+    settings: SceneSettings, cache: Path | None = None
 ) -> Mapping[str, tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]]:
     """Supervision of every training view at levels 0 to 3, by view name; what `write_scene` puts on disk."""
-    capture = open_capture(recipe, cache)
-    return {shot.name: _levels(recipe, capture, shot.photo, shot.number) for shot in capture.train}
+    capture = open_capture(settings, cache)
+    return {
+        shot.name: _levels(settings, capture, shot.photo, shot.number) for shot in capture.train
+    }
 
 
 def _supervise(
-    recipe: Recipe, cache: Path | None, level: int, camera: Camera, number: int
+    settings: SceneSettings, cache: Path | None, level: int, camera: Camera, number: int
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]]:
     """Language maps of a rendered image, in place of SAM and CLIP: the exact regions at its camera, with errors like those of a photograph.
 
     Real extractors would also stumble over the faults of the render.
     """
-    capture = open_capture(recipe, cache)
+    capture = open_capture(settings, cache)
     photo = photograph(capture.world, camera)
-    masks = _levels(recipe, capture, photo, MAX_VIEWS + 1 + number)[level]
+    masks = _levels(settings, capture, photo, MAX_VIEWS + 1 + number)[level]
     return torch.from_numpy(masks.index.astype(np.int32)), torch.from_numpy(masks.vectors)
 
 
 def _levels(
-    recipe: Recipe, capture: Capture, photo: Photograph, number: int
+    settings: SceneSettings, capture: Capture, photo: TracedImage, number: int
 ) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
-    faults = recipe.faults.resolve(recipe.difficulty)
-    key = (recipe.seed, zlib.crc32(f"{recipe.scene.key} {recipe.difficulty}".encode()), number)
+    faults = settings.faults.resolve(settings.difficulty)
+    key = (
+        settings.seed,
+        zlib.crc32(f"{settings.scene.key} {settings.difficulty}".encode()),
+        number,
+    )
     return view_masks(*regions(capture.world, photo), capture.classes, faults, key)
 
 
@@ -149,5 +157,5 @@ def _shares(total: int, parts: int) -> list[int]:
     return [total * (i + 1) // parts - total * i // parts for i in range(parts)]
 
 
-def _draws(recipe: Recipe, shot: Shot) -> np.random.Generator:
-    return np.random.default_rng([_POINTS, recipe.seed, shot.number])
+def _draws(settings: SceneSettings, shot: Shot) -> np.random.Generator:
+    return np.random.default_rng([_POINTS, settings.seed, shot.number])

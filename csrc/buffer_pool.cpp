@@ -1,4 +1,4 @@
-#include "buffer.h"
+#include "buffer_pool.h"
 
 #include <bit>
 #include <mutex>
@@ -21,8 +21,8 @@ struct Block {
   void *data;
 };
 
-struct Shelf {
-  Shelf() { blocks.reserve(kMostBlocks); }
+struct Pool {
+  Pool() { blocks.reserve(kMostBlocks); }
 
   std::mutex lock;
   std::vector<Block> blocks;
@@ -30,8 +30,8 @@ struct Shelf {
 };
 
 // Never destroyed: a buffer may be given back while the process ends.
-Shelf &shelf() {
-  static Shelf *const one = new Shelf;
+Pool &pool() {
+  static Pool *const one = new Pool;
   return *one;
 }
 
@@ -47,7 +47,7 @@ void *take_block(int64_t bytes) {
   if (bytes < kLarge) return ::operator new(size_t(bytes), kAlign);
   const int64_t size = rounded(bytes);
   {
-    Shelf &s = shelf();
+    Pool &s = pool();
     const std::lock_guard guard(s.lock);
     for (Block &b : s.blocks)
       if (b.size == size) {
@@ -64,7 +64,7 @@ void *take_block(int64_t bytes) {
 void give_block(void *block, int64_t bytes) noexcept {
   if (bytes >= kLarge) {
     const int64_t size = rounded(bytes);
-    Shelf &s = shelf();
+    Pool &s = pool();
     const std::lock_guard guard(s.lock);
     if (s.bytes + size <= kKeptBytes && s.blocks.size() < kMostBlocks) {
       s.blocks.push_back({size, block});

@@ -276,7 +276,7 @@ VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
 }
 
 template <class T, int kChains, Need kNeed>
-void blend_tile_backward(const Tile<T> &given, T *slots) {
+void rasterize_tile_backward(const Tile<T> &given, T *slots) {
   const Tile<T> tile = given;  // a copy that no store can reach stays in registers
   const Pass<T> &p = *tile.pass;
   Live live = live_blocks(tile);
@@ -296,23 +296,23 @@ void blend_tile_backward(const Tile<T> &given, T *slots) {
 }
 
 template <class T, int kChains>
-void blend_tile_backward(const Tile<T> &tile, T *slots) {
+void rasterize_tile_backward(const Tile<T> &tile, T *slots) {
   const Pass<T> &p = *tile.pass;
   if (p.shape_grads)
-    blend_tile_backward<T, kChains, Need::kShape>(tile, slots);
+    rasterize_tile_backward<T, kChains, Need::kShape>(tile, slots);
   else if (p.weight_grads)
-    blend_tile_backward<T, kChains, Need::kWeight>(tile, slots);
+    rasterize_tile_backward<T, kChains, Need::kWeight>(tile, slots);
   else
-    blend_tile_backward<T, kChains, Need::kValuesOnly>(tile, slots);
+    rasterize_tile_backward<T, kChains, Need::kValuesOnly>(tile, slots);
 }
 
 }  // namespace
 
-int64_t backward_scratch(const Pass<T> &p, int64_t list_length) {
+int64_t rasterize_backward_scratch(const Pass<T> &p, int64_t list_length) {
   return list_length * kRecord + kBlocks * ((p.padded_channels + p.chains) * kLanes + state_size(p.chains));
 }
 
-bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
+bool rasterize_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
   const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin;
   Carver<T> carver{scratch};
   Tile<T> tile{};
@@ -338,7 +338,7 @@ bool blend_backward(const Pass<T> &p, int64_t index, T *scratch, T *slots) {
       store(chain + kBehind * kLanes, splat(T(0)));
     }
   }
-  p.chains == 1 ? blend_tile_backward<T, 1>(tile, slots) : blend_tile_backward<T, 2>(tile, slots);
+  p.chains == 1 ? rasterize_tile_backward<T, 1>(tile, slots) : rasterize_tile_backward<T, 2>(tile, slots);
   return true;
 }
 

@@ -77,7 +77,7 @@ def flatten(row: Any) -> dict[str, Any]:
     return columns
 
 
-def write_sheet(path: Path, rows: Sequence[Any], header: Mapping[str, object]) -> None:
+def write_record(path: Path, rows: Sequence[Any], header: Mapping[str, object]) -> None:
     """One line per row (dataclasses of one kind), under comments that say who measured; whole or not at all.
 
     Raises:
@@ -96,7 +96,7 @@ def write_sheet(path: Path, rows: Sequence[Any], header: Mapping[str, object]) -
     write_atomically(path, text.getvalue().encode())
 
 
-def read_sheet(path: Path) -> pd.DataFrame:
+def read_record(path: Path) -> pd.DataFrame:
     """The rows of such a file.
 
     Raises:

@@ -14,14 +14,14 @@ from vlgs.ops.project import Splats
 from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
 
 
-def blend(
+def rasterize_to_pixels(
     splats: Splats, groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
 ) -> Rendered:
     """Every group's values blended with its weights, on checked input; `vlgs.ops.rasterize_reference` defines it."""
     return KERNELS.of(splats.depth)(splats, groups, camera, config)
 
 
-class Work(NamedTuple):
+class RasterizeWork(NamedTuple):
     """The amount of work of a forward pass."""
 
     entries: int
@@ -32,7 +32,7 @@ class Work(NamedTuple):
 
 def count_work(
     splats: Splats, groups: Sequence[ChannelGroup], camera: Camera, config: RasterConfig
-) -> Work:
+) -> RasterizeWork:
     """Blend once more, on the CPU, and count; for benchmarks.
 
     Raises:
@@ -41,16 +41,16 @@ def count_work(
     layout, weights = _lay_out(groups, camera, config)
     values = [groups[i].values for i in layout.order]
     with torch.no_grad():
-        return Work(*_blend(layout, True, *splats, *weights, *values)[0].work())
+        return RasterizeWork(*_rasterize(layout, True, *splats, *weights, *values)[0].work())
 
 
 def weights_alone(
     splats: Splats, weight: Tensor, camera: Camera, config: RasterConfig
-) -> tuple[_csrc.BlendFloat | _csrc.BlendDouble, Tensor, Tensor]:
+) -> tuple[_csrc.RasterizedFloat | _csrc.RasterizedDouble, Tensor, Tensor]:
     """A picture of nothing but weights, as the CPU's kernel holds it, with `visible` and the accumulated weight."""
     nothing = ChannelGroup(weight.new_zeros(len(weight), 1), weight)
     layout, weights = _lay_out([nothing], camera, config)
-    picture, (visible, alpha, _) = _blend(layout, True, *splats, *weights, nothing.values)
+    picture, (visible, alpha, _) = _rasterize(layout, True, *splats, *weights, nothing.values)
     return picture, visible, alpha
 
 
@@ -59,7 +59,7 @@ class _Layout(NamedTuple):
 
     width: int
     height: int
-    config: _csrc.BlendConfig
+    config: _csrc.RasterizeConfig
     shape_grads: list[bool]
     """Per chain."""
     order: list[int]
@@ -87,8 +87,8 @@ def _lay_out(
 
 
 @lru_cache(maxsize=64)
-def _kernel_config(config: RasterConfig) -> _csrc.BlendConfig:
-    return _csrc.BlendConfig(
+def _kernel_config(config: RasterConfig) -> _csrc.RasterizeConfig:
+    return _csrc.RasterizeConfig(
         config.alpha_min,
         config.alpha_max,
         config.transmittance_min,
@@ -100,8 +100,8 @@ def _kernel_config(config: RasterConfig) -> _csrc.BlendConfig:
     )
 
 
-def _blend(layout: _Layout, keep: bool, *tensors: Tensor):
-    """The kernel's object and the outputs of `_Blend`; nothing is kept for a backward pass unless asked for."""
+def _rasterize(layout: _Layout, keep: bool, *tensors: Tensor):
+    """The kernel's object and the outputs of `_RasterizeToPixels`; nothing is kept for a backward pass unless asked for."""
     mean2d, ellipse, depth, *rest = [t.contiguous() for t in tensors]
     num_chains = len(layout.shape_grads)
     weights, values = rest[:num_chains], rest[num_chains:]
@@ -109,21 +109,21 @@ def _blend(layout: _Layout, keep: bool, *tensors: Tensor):
     visible = torch.empty(len(depth), dtype=torch.bool)
     alphas = [depth.new_empty(size) for _ in weights]
     images = [depth.new_empty(*size, v.shape[1]) for v in values]
-    kernel = _csrc.BlendFloat if depth.dtype == torch.float32 else _csrc.BlendDouble
-    blend = kernel(
+    kernel = _csrc.RasterizedFloat if depth.dtype == torch.float32 else _csrc.RasterizedDouble
+    picture = kernel(
         mean2d, ellipse, depth, weights, layout.shape_grads, values, layout.order, layout.chain_of,
         layout.config, images, alphas, visible, keep, torch.get_num_threads(),
     )  # fmt: skip
-    return blend, (visible, *alphas, *images)
+    return picture, (visible, *alphas, *images)
 
 
-class _Blend(torch.autograd.Function):
+class _RasterizeToPixels(torch.autograd.Function):
     """Splats, one weight per chain and the values of every group to (visible, alpha per chain, image per group)."""
 
     @staticmethod
     def forward(ctx: Any, layout: _Layout, *tensors: Tensor):
         tensors = tuple(t.contiguous() for t in tensors)
-        ctx.blend, outputs = _blend(layout, True, *tensors)
+        ctx.picture, outputs = _rasterize(layout, True, *tensors)
         mean2d, ellipse, _, *rest = tensors
         ctx.save_for_backward(mean2d, ellipse, *rest)
         ctx.num_chains = len(layout.shape_grads)
@@ -143,7 +143,7 @@ class _Blend(torch.autograd.Function):
         needs = (needs_mean2d, needs_ellipse, *needs_rest)
         grads = [torch.empty_like(t) if n else None for t, n in zip(saved, needs, strict=True)]
         d_mean2d, d_ellipse, *d_rest = grads
-        ctx.blend.backward(
+        ctx.picture.backward(
             saved[2 + num_chains :], d_pictures[num_chains:], d_pictures[:num_chains],
             d_mean2d, d_ellipse, d_rest[:num_chains], d_rest[num_chains:], torch.get_num_threads(),
         )  # fmt: skip
@@ -157,9 +157,9 @@ def _on_cpu(
     values = [groups[i].values for i in layout.order]
     tensors = (*splats, *weights, *values)
     if differentiated(tensors):
-        visible, *pictures = _Blend.apply(layout, *tensors)
+        visible, *pictures = _RasterizeToPixels.apply(layout, *tensors)
     else:
-        visible, *pictures = _blend(layout, False, *tensors)[1]
+        visible, *pictures = _rasterize(layout, False, *tensors)[1]
     images: list[Tensor] = [visible] * len(groups)
     alphas = list(images)
     for image, i, chain in zip(
@@ -169,4 +169,4 @@ def _on_cpu(
     return Rendered(tuple(images), tuple(alphas), visible, splats.mean2d)
 
 
-KERNELS = Kernels("blend", cpu=_on_cpu)
+KERNELS = Kernels("rasterize_to_pixels", cpu=_on_cpu)

@@ -15,7 +15,7 @@ MAX_VIEWS = 9999
 
 
 @dataclass(frozen=True)
-class Recipe:
+class SceneSettings:
     """All parameters but the mask level; `load_scene` says what they mean."""
 
     scene: SceneFile = field(default_factory=lambda: find_scene("glassware"))

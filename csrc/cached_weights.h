@@ -7,12 +7,12 @@
 namespace vlgs {
 
 template <class T>
-class Frozen {
+class CachedWeights {
  public:
   // Counts the weights of the first chain of a picture; `keep` then writes them. In between `bytes` says what
   // they will take.
-  Frozen(const Blend<T> &, int threads);
-  void keep(const Blend<T> &, int threads);
+  CachedWeights(const Rasterized<T> &, int threads);
+  void keep(const Rasterized<T> &, int threads);
 
   int64_t bytes() const;
   bool kept() const { return kept_; }
@@ -34,8 +34,8 @@ class Frozen {
   Buffer<uint32_t> ids_;              // [entries] row of the Gaussian
   Buffer<T> weights_;                 // [entries, kPixels]
   std::vector<int64_t> row_begin_;    // [n + 1]
-  Buffer<uint32_t> entries_;          // [entries + kFrozenAhead] those of a row, in the order of the blocks
-  Buffer<uint32_t> blocks_;           // [entries] their blocks
+  Buffer<uint32_t> entries_;  // [entries + kCachedWeightsAhead] those of a row, in the order of the blocks
+  Buffer<uint32_t> blocks_;   // [entries] their blocks
 };
 
 }  // namespace vlgs

@@ -9,7 +9,7 @@ import pandas as pd
 
 from tests.fuzz_kernel import FuzzReport
 from tests.recorded import commit_with, same_code_with
-from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
+from vlgs.bench.record import provenance, read_record, say, write_record
 
 FOLDER = Path(__file__).parent
 CHUNK = 500
@@ -81,7 +81,7 @@ def run_fuzz(
             seconds=mine.seconds + time.perf_counter() - start,
         )
         rows = sorted([*others, mine], key=lambda row: (row.sanitizers, row.isa))
-        write_sheet(path, rows, header)
+        write_record(path, rows, header)
         say(f"{isa}, sanitizers {sanitizers}: {mine.scenes} scenes, {mine.outcome}")
     return mine
 
@@ -89,5 +89,5 @@ def run_fuzz(
 def _read(path: Path) -> list[dict]:
     if not path.is_file():
         return []
-    table = read_sheet(path)
+    table = read_record(path)
     return table.astype(object).where(pd.notna(table), None).to_dict("records")  # pyright: ignore[reportReturnType]

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from tests.recorded import commit_with, same_code_with
 from tests.stress.case import CannotRunError, Case
-from vlgs.bench.sheet import provenance, read_sheet, say, write_sheet
+from vlgs.bench.record import provenance, read_record, say, write_record
 from vlgs.ops.machine import instruction_set
 
 FOLDER = Path(__file__).parent
@@ -76,7 +76,7 @@ def run_cases(cases: Sequence[Case], full: bool, path: Path | None) -> list[Stre
         say(f"{row.case}: {row.outcome}{how}")
         if path is not None:
             # Rows of cases yet to come stay out: they are of other code.
-            write_sheet(path, [done[c.name] for c in cases if c.name in done], header)
+            write_record(path, [done[c.name] for c in cases if c.name in done], header)
     return [done[case.name] for case in cases]
 
 
@@ -84,7 +84,7 @@ def _passed(path: Path | None, here: str | None, isa: str) -> dict[str, StressRo
     """Rows of a file that need not be run again, by case."""
     if path is None or not path.is_file():
         return {}
-    table = read_sheet(path)
+    table = read_record(path)
     if list(table) != [field.name for field in fields(StressRow)]:  # of an older version
         return {}
     times = ("seconds", "cpu_seconds")  # whole ones come as int

@@ -1,4 +1,4 @@
-#include "lists.h"
+#include "binning.h"
 
 #include <algorithm>
 #include <bit>
@@ -86,7 +86,7 @@ template <class T>
 bool reaches_any(const Grid &grid, const T *g, T cutoff) {
   const Box box = box_of(grid, g, cutoff);
   std::vector<uint16_t> masks(size_t(Extent<T>{box, cutoff}.tiles()));
-  kernels<T>().cover(grid, g, cutoff, box, masks.data());
+  kernels<T>().tile_intersect(grid, g, cutoff, box, masks.data());
   return std::any_of(masks.begin(), masks.end(), [](uint16_t mask) { return mask != 0; });
 }
 
@@ -147,8 +147,8 @@ DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
 }
 
 template <class T>
-TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, const T *records, int chains,
-                     T alpha_min, const Trim &trim, int64_t budget, bool *visible, int threads) {
+TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order, const T *records, int chains,
+                        T alpha_min, const Trim &trim, int64_t budget, bool *visible, int threads) {
   const int64_t tiles = grid.tiles_x * grid.tiles_y, m = order.count;
   std::fill(visible, visible + n, false);
 
@@ -179,7 +179,7 @@ TileLists make_lists(const Grid &grid, int64_t n, const DepthOrder<T> &order, co
     for (int64_t rank = r.begin; rank < r.end; ++rank) {
       const Extent<T> &e = extents[rank];
       uint16_t *mask = masks.data() + first[rank];
-      kernels<T>().cover(grid, records + rank * kRecord, e.cutoff, e.box, mask);
+      kernels<T>().tile_intersect(grid, records + rank * kRecord, e.cutoff, e.box, mask);
       bool reaches = false;
       for (int64_t y = e.box.y0; y < e.box.y1; ++y)
         for (int64_t x = e.box.x0; x < e.box.x1; ++x, ++mask) {
@@ -234,9 +234,9 @@ template DepthOrder<float> sort_visible(const Grid &, int64_t, const Splats<floa
                                         const std::vector<const float *> &, float, int);
 template DepthOrder<double> sort_visible(const Grid &, int64_t, const Splats<double> &,
                                          const std::vector<const double *> &, double, int);
-template TileLists make_lists(const Grid &, int64_t, const DepthOrder<float> &, const float *, int, float,
-                              const Trim &, int64_t, bool *, int);
-template TileLists make_lists(const Grid &, int64_t, const DepthOrder<double> &, const double *, int, double,
-                              const Trim &, int64_t, bool *, int);
+template TileLists bin_gaussians(const Grid &, int64_t, const DepthOrder<float> &, const float *, int, float,
+                                 const Trim &, int64_t, bool *, int);
+template TileLists bin_gaussians(const Grid &, int64_t, const DepthOrder<double> &, const double *, int,
+                                 double, const Trim &, int64_t, bool *, int);
 
 }  // namespace vlgs

@@ -5,19 +5,19 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz_kernel import FuzzReport
-from tests.fuzz_kernel import sheet as fuzz_sheet
-from tests.fuzz_kernel.sheet import CHUNK, run_fuzz
-from tests.stress import sheet
+from tests.fuzz_kernel import record as fuzz_record
+from tests.fuzz_kernel.record import CHUNK, run_fuzz
+from tests.stress import record
 from tests.stress.case import Case, Verdict
-from tests.stress.sheet import run_cases
-from vlgs.bench.sheet import read_sheet
+from tests.stress.record import run_cases
+from vlgs.bench.record import read_record
 
 
 @pytest.fixture
 def code(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The commit that the modules believe to be at."""
     now = ["a" * 40]
-    for module in (fuzz_sheet, sheet):
+    for module in (fuzz_record, record):
         monkeypatch.setattr(module, "commit_with", lambda folder: now[0])
         monkeypatch.setattr(module, "same_code_with", lambda folder, one, other: one == other)
     return now
@@ -48,7 +48,7 @@ def test_the_fuzz_continues_where_it_ended(tmp_path: Path, code: list[str]):
     assert (row.scenes, row.refused, row.finite) == (2 * CHUNK, 3, 2 * CHUNK - 3)
     run_fuzz("v3", "none", 10, third, path)
     run_fuzz("v4", "address", 20, third, path)
-    found = read_sheet(path)
+    found = read_record(path)
     assert list(zip(found.isa, found.sanitizers, found.scenes, strict=True)) == [
         ("v4", "address", 20),
         ("v3", "none", 10),
@@ -62,7 +62,7 @@ def test_other_code_begins_the_fuzz_again(tmp_path: Path, code: list[str]):
     code[0] = "b" * 40
     run_fuzz("v4", "none", 40, again, path)
     assert again.asked == [range(40)]
-    found = read_sheet(path)
+    found = read_record(path)
     assert list(found.scenes) == [40]
     assert list(found.commit) == ["b" * 40]
 
@@ -72,7 +72,7 @@ def test_a_failure_is_recorded_and_run_again(tmp_path: Path, code: list[str]):
     row = run_fuzz("v4", "none", 3 * CHUNK, broken, path)
     assert len(broken.asked) == 2, "what comes after a failure is not run"
     assert row.outcome == f"seed {CHUNK + 3}: it broke"
-    assert list(read_sheet(path).failed) == [1]
+    assert list(read_record(path).failed) == [1]
     assert run_fuzz("v4", "none", 5, mended, path).outcome == "clean"
     assert mended.asked == [range(5)]
 
@@ -90,16 +90,16 @@ def test_cases_are_recorded_one_by_one_and_not_run_again(tmp_path: Path, code: l
 
     a, b, c = case("N1 a"), case("N2 b", passed=False, minutes=2), case("N3 c")
     run_cases([a, b, c], True, path)
-    assert list(read_sheet(path).case) == ["N1 a", "N2 b", "N3 c"]
+    assert list(read_record(path).case) == ["N1 a", "N2 b", "N3 c"]
     run_cases([a, b, c], True, path)
     assert ran == ["N1 a", "N3 c", "N2 b", "N2 b"], "what failed runs again, what passed does not"
-    assert list(read_sheet(path).measured) == ["1, as written", "4, as written", "2, as written"]
+    assert list(read_record(path).measured) == ["1, as written", "4, as written", "2, as written"]
     run_cases([a, c], True, None)
     assert ran[4:] == ["N1 a", "N3 c"], "without a file everything runs"
     code[0] = "b" * 40
     run_cases([a], True, path)
     assert ran[6:] == ["N1 a"]
-    assert list(read_sheet(path).commit) == ["b" * 40]
+    assert list(read_record(path).commit) == ["b" * 40]
 
 
 def test_a_case_that_ends_the_process_leaves_those_before_it(tmp_path: Path, code: list[str]):
@@ -114,4 +114,4 @@ def test_a_case_that_ends_the_process_leaves_those_before_it(tmp_path: Path, cod
     path = tmp_path / "stress.csv"
     with pytest.raises(KeyboardInterrupt):
         run_cases([Case("N1 a", holds), Case("N2 b", ends)], True, path)
-    assert list(read_sheet(path).case) == ["N1 a"]
+    assert list(read_record(path).case) == ["N1 a"]

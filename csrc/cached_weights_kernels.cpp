@@ -1,4 +1,4 @@
-// Kept weights: how they are formed, and the two sparse products with them (frozen.h).
+// Kept weights: how they are formed, and the two sparse products with them (cached_weights.h).
 #include "alpha.h"
 
 namespace vlgs::VLGS_ISA_NS {
@@ -32,7 +32,8 @@ inline void gather_channels(int64_t count, const uint32_t *entries, const uint32
   Pack<T> acc[kLanes];
   for (auto &a : acc) a = splat(T(0));
   for (int64_t j = 0; j < count; ++j) {
-    const T *ahead = weights + int64_t(entries[j + kFrozenAhead]) * kLanes;  // may be of the next Gaussian
+    const T *ahead =
+        weights + int64_t(entries[j + kCachedWeightsAhead]) * kLanes;  // may be of the next Gaussian
     for (int i = 0; i < kLanes; i += 64 / int(sizeof(T))) __builtin_prefetch(ahead + i);
     const Pack<T> weight = load(weights + int64_t(entries[j]) * kLanes);
     const T *at = upstream + int64_t(blocks[j]) * channels * kLanes;
@@ -46,7 +47,7 @@ inline void gather_channels(int64_t count, const uint32_t *entries, const uint32
 }  // namespace
 
 // The walk of the forward pass, front to back, up to the last contribution that it noted for each pixel.
-void freeze(const Pass<T> &p, int64_t tile, int64_t *counts, uint32_t *ids, T *weights) {
+void cache_weights(const Pass<T> &p, int64_t tile, int64_t *counts, uint32_t *ids, T *weights) {
   const int64_t begin = p.tile_begin[tile], length = p.tile_begin[tile + 1] - begin;
   const Pack<T> zero = splat(T(0));
   for (int b = 0; b < kBlocks; ++b) {
@@ -74,8 +75,8 @@ void freeze(const Pass<T> &p, int64_t tile, int64_t *counts, uint32_t *ids, T *w
   }
 }
 
-void frozen_blend(const Grid &grid, int64_t block, int64_t count, const uint32_t *ids, const T *weights,
-                  const T *values, int64_t channels, T *scratch, T *image) {
+void cached_weights_render(const Grid &grid, int64_t block, int64_t count, const uint32_t *ids,
+                           const T *weights, const T *values, int64_t channels, T *scratch, T *image) {
   int64_t k = 0;
   for (; k + 8 <= channels; k += 8)
     add_channels<T, 8>(count, ids, weights, values + k, channels, scratch + k * kLanes);
@@ -92,7 +93,7 @@ void frozen_blend(const Grid &grid, int64_t block, int64_t count, const uint32_t
   }
 }
 
-void frozen_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t channels, T *packs) {
+void cached_weights_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t channels, T *packs) {
   const Corner first = corner(grid, block);
   for (int l = 0; l < kLanes; ++l) {
     const int64_t x = first.x + l % 4, y = first.y + l / 4;
@@ -102,8 +103,8 @@ void frozen_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t 
   }
 }
 
-void frozen_backward(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
-                     const T *upstream, int64_t channels, T *d_value) {
+void cached_weights_backward(int64_t count, const uint32_t *entries, const uint32_t *blocks, const T *weights,
+                             const T *upstream, int64_t channels, T *d_value) {
   int64_t k = 0;
   for (; k + 8 <= channels; k += 8)
     gather_channels<T, 8>(count, entries, blocks, weights, upstream + k * kLanes, channels, d_value + k);

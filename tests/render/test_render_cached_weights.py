@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_scenes import Splats, random_splats, relative_error, render
+from render_scenes import RenderScene, random_splats, relative_error, render
 from torch import Tensor
 
-from vlgs.fields.cached_weights import FrozenViews
-from vlgs.ops.cached_weights import FrozenBudgetError, FrozenView
+from vlgs.fields.cached_weights import CachedViews
+from vlgs.ops.cached_weights import CacheBudgetError, CachedView
 from vlgs.types import Camera, RasterConfig
 
 
-def freeze(splats: Splats, config: RasterConfig | None = None, **more: int) -> FrozenView:
+def freeze(splats: RenderScene, config: RasterConfig | None = None, **more: int) -> CachedView:
     camera = Camera(splats.viewmat, splats.K, splats.width, splats.height)
     geometry = splats.means, splats.quats, splats.scales, splats.weights[0]
-    return FrozenView(*geometry, camera, config or RasterConfig(), **more)
+    return CachedView(*geometry, camera, config or RasterConfig(), **more)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -76,7 +76,7 @@ def test_the_budget_is_checked_before_weights_are_kept():
     size = freeze(splats).nbytes
     assert freeze(splats, budget=size).nbytes == size
     with pytest.raises(
-        FrozenBudgetError, match=rf"weights must be within {size - 1} bytes, got {size}"
+        CacheBudgetError, match=rf"weights must be within {size - 1} bytes, got {size}"
     ):
         freeze(splats, budget=size - 1)
 
@@ -88,7 +88,7 @@ def test_as_many_views_are_kept_as_fit(caplog: pytest.LogCaptureFixture):
         "means": splats.means, "quats": splats.quats, "scales": splats.scales,
         "weight": splats.weights[0], "camera": camera, "config": RasterConfig(),
     }  # fmt: skip
-    views = FrozenViews(2 * freeze(splats).nbytes)
+    views = CachedViews(2 * freeze(splats).nbytes)
     with caplog.at_level("INFO"):
         made = [views.make(i, **arguments) for i in range(4)]
     assert [view is not None for view in made] == [True, True, False, False]
@@ -109,9 +109,9 @@ def test_bad_input_is_refused():
     broken = splats.values[0].clone()
     broken[4, 1] = float("nan")
     with pytest.raises(
-        ValueError, match=r"values of a frozen view must be finite, got nan in row 4"
+        ValueError, match=r"values of a cached view must be finite, got nan in row 4"
     ):
         view.render(broken)
     values = splats.values[0].clone().requires_grad_()
-    with pytest.raises(ValueError, match=r"gradient of a frozen view must be finite, got inf"):
+    with pytest.raises(ValueError, match=r"gradient of a cached view must be finite, got inf"):
         view.render(values).backward(torch.full((splats.height, splats.width, 3), float("inf")))

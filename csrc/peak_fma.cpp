@@ -4,12 +4,12 @@
 
 namespace vlgs::VLGS_ISA_NS {
 
-T multiply_add(int64_t rounds, T factor, T addend) {
+T peak_fma(int64_t rounds, T factor, T addend) {
   using Native = typename Pack<T>::Native;
   constexpr int kParts = Pack<T>::kParts;
   const Native a = factor - Native{}, b = addend - Native{};
-  Native sums[kYardstick];  // each from another number, or they would be one
-  for (int k = 0; k < kYardstick; ++k) sums[k] = T(k) * b;
+  Native sums[kPeakFmaPacks];  // each from another number, or they would be one
+  for (int k = 0; k < kPeakFmaPacks; ++k) sums[k] = T(k) * b;
   // Ten registers at a time hide the latency of any machine and fit where there are sixteen.
   for (int64_t i = 0; i < rounds * kParts; ++i)
     for (Native &sum : sums) sum = native_fma(sum, a, b);

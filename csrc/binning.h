@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "buffer.h"
+#include "buffer_pool.h"
 #include "kernels.h"
 #include "threads.h"
 
@@ -46,7 +46,7 @@ struct TileLists {
 // `records` [m, kRecord] hold the geometry. Sets visible[i] of the rows that reach a pixel above alpha_min in
 // any chain. Throws std::invalid_argument if the lists would take more than `budget` bytes.
 template <class T>
-TileLists make_lists(const Grid &, int64_t n, const DepthOrder<T> &, const T *records, int chains,
-                     T alpha_min, const Trim &, int64_t budget, bool *visible, int threads);
+TileLists bin_gaussians(const Grid &, int64_t n, const DepthOrder<T> &, const T *records, int chains,
+                        T alpha_min, const Trim &, int64_t budget, bool *visible, int threads);
 
 }  // namespace vlgs

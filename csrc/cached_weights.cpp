@@ -1,4 +1,4 @@
-#include "frozen.h"
+#include "cached_weights.h"
 
 #include <omp.h>
 
@@ -13,22 +13,22 @@
 namespace vlgs {
 
 template <class T>
-Frozen<T>::Frozen(const Blend<T> &picture, int threads)
+CachedWeights<T>::CachedWeights(const Rasterized<T> &picture, int threads)
     : n_(picture.rows()), grid_(picture.pass().grid), row_begin_(size_t(n_) + 1) {
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y;
   block_begin_.assign(size_t(tiles) * kBlocks + 1, 0);
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
   for (int64_t tile = 0; tile < tiles; ++tile)
-    kernels<T>().freeze(picture.pass(), tile, block_begin_.data() + tile * kBlocks, nullptr, nullptr);
+    kernels<T>().cache_weights(picture.pass(), tile, block_begin_.data() + tile * kBlocks, nullptr, nullptr);
   int64_t entries = 0;
   for (int64_t &count : block_begin_) entries += std::exchange(count, entries);
   if (std::max(entries, tiles * kBlocks) > int64_t(std::numeric_limits<uint32_t>::max()))
-    throw std::invalid_argument("frozen view: weights must be fewer than 2^32, got " +
+    throw std::invalid_argument("cached view: weights must be fewer than 2^32, got " +
                                 std::to_string(entries));
 }
 
 template <class T>
-void Frozen<T>::keep(const Blend<T> &picture, int threads) {
+void CachedWeights<T>::keep(const Rasterized<T> &picture, int threads) {
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y, entries = block_begin_.back();
   ids_ = Buffer<uint32_t>(entries);
   weights_ = Buffer<T>(entries * kPixels);
@@ -36,73 +36,74 @@ void Frozen<T>::keep(const Blend<T> &picture, int threads) {
   for (int64_t tile = 0; tile < tiles; ++tile) {
     int64_t counts[kBlocks];
     const int64_t *begin = block_begin_.data() + tile * kBlocks;
-    kernels<T>().freeze(picture.pass(), tile, counts, ids_.data() + begin[0],
-                        weights_.data() + begin[0] * kPixels);
+    kernels<T>().cache_weights(picture.pass(), tile, counts, ids_.data() + begin[0],
+                               weights_.data() + begin[0] * kPixels);
   }
   index_by_gaussian();
   kept_ = true;
 }
 
 template <class T>
-void Frozen<T>::index_by_gaussian() {
+void CachedWeights<T>::index_by_gaussian() {
   const int64_t entries = block_begin_.back();
   for (int64_t k = 0; k < entries; ++k) ++row_begin_[ids_[k]];
   int64_t place = 0;
   for (int64_t &count : row_begin_) place += std::exchange(count, place);
   std::vector<int64_t> next(row_begin_);
-  entries_ = Buffer<uint32_t>(entries + kFrozenAhead);
+  entries_ = Buffer<uint32_t>(entries + kCachedWeightsAhead);
   blocks_ = Buffer<uint32_t>(entries);
   for (size_t block = 0; block + 1 < block_begin_.size(); ++block)
     for (int64_t k = block_begin_[block]; k < block_begin_[block + 1]; ++k) {
       const int64_t to = next[ids_[k]]++;
       entries_[to] = uint32_t(k), blocks_[to] = uint32_t(block);
     }
-  std::fill(entries_.data() + entries, entries_.data() + entries + kFrozenAhead, 0u);
+  std::fill(entries_.data() + entries, entries_.data() + entries + kCachedWeightsAhead, 0u);
 }
 
 template <class T>
-int64_t Frozen<T>::bytes() const {
+int64_t CachedWeights<T>::bytes() const {
   return block_begin_.back() * int64_t(kPixels * sizeof(T) + 3 * sizeof(uint32_t)) +
          int64_t((block_begin_.size() + row_begin_.size()) * sizeof(int64_t));
 }
 
 template <class T>
-void Frozen<T>::render(const T *values, int64_t channels, T *image, int threads) const {
+void CachedWeights<T>::render(const T *values, int64_t channels, T *image, int threads) const {
   if (any_not_finite(values, n_ * channels))
-    check_rows("values of a frozen view must be finite", values, n_, channels, -kLargest, kLargest);
+    check_rows("values of a cached view must be finite", values, n_, channels, -kLargest, kLargest);
   const Kernels<T> &kernel = kernels<T>();
   const int64_t blocks = int64_t(block_begin_.size()) - 1;
   const Buffer<T> scratch(threads * channels * kPixels);
 #pragma omp parallel for num_threads(threads) schedule(dynamic, kBlocks)
   for (int64_t block = 0; block < blocks; ++block) {
     const int64_t begin = block_begin_[block];
-    kernel.frozen_blend(grid_, block, block_begin_[block + 1] - begin, ids_.data() + begin,
-                        weights_.data() + begin * kPixels, values, channels,
-                        scratch.data() + omp_get_thread_num() * channels * kPixels, image);
+    kernel.cached_weights_render(grid_, block, block_begin_[block + 1] - begin, ids_.data() + begin,
+                                 weights_.data() + begin * kPixels, values, channels,
+                                 scratch.data() + omp_get_thread_num() * channels * kPixels, image);
   }
 }
 
 // By Gaussian, each by one thread and over its blocks in order, so that the bits do not depend on the
 // threads.
 template <class T>
-void Frozen<T>::backward(const T *d_image, int64_t channels, T *d_values, int threads) const {
+void CachedWeights<T>::backward(const T *d_image, int64_t channels, T *d_values, int threads) const {
   const int64_t pixels = grid_.height * grid_.width, blocks = int64_t(block_begin_.size()) - 1;
   if (any_not_finite(d_image, pixels * channels))
-    check_rows("gradient of a frozen view must be finite", d_image, pixels, channels, -kLargest, kLargest);
+    check_rows("gradient of a cached view must be finite", d_image, pixels, channels, -kLargest, kLargest);
   const Kernels<T> &kernel = kernels<T>();
   const Buffer<T> upstream(blocks * channels * kPixels);
 #pragma omp parallel for num_threads(threads)
   for (int64_t block = 0; block < blocks; ++block)
-    kernel.frozen_upstream(grid_, block, d_image, channels, upstream.data() + block * channels * kPixels);
+    kernel.cached_weights_upstream(grid_, block, d_image, channels,
+                                   upstream.data() + block * channels * kPixels);
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 64)
   for (int64_t i = 0; i < n_; ++i) {
     const int64_t begin = row_begin_[i];
-    kernel.frozen_backward(row_begin_[i + 1] - begin, entries_.data() + begin, blocks_.data() + begin,
-                           weights_.data(), upstream.data(), channels, d_values + i * channels);
+    kernel.cached_weights_backward(row_begin_[i + 1] - begin, entries_.data() + begin, blocks_.data() + begin,
+                                   weights_.data(), upstream.data(), channels, d_values + i * channels);
   }
 }
 
-template class Frozen<float>;
-template class Frozen<double>;
+template class CachedWeights<float>;
+template class CachedWeights<double>;
 
 }  // namespace vlgs

@@ -122,7 +122,7 @@ void boxes(Grid grid, int64_t count, const T *mean2d, const T *ellipse, T octave
   }
 }
 
-void cover(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
+void tile_intersect(Grid grid, const T *record, T cutoff, Box box, uint16_t *masks) {
   const Ellipse<T> e = ellipse(grid, record, cutoff, box);
   for (int32_t y = box.y0; y < box.y1; ++y) {
     const BlockRows rows = block_rows(e, y * kTile);

@@ -192,7 +192,7 @@ inline int64_t list_block(const uint16_t *masks, int64_t count, int b, uint32_t 
 }
 
 template <class T, int kChains, bool kBefore>
-void blend_tile(const Tile<T> &tile) {
+void rasterize_tile(const Tile<T> &tile) {
   const Pass<T> &p = *tile.pass;
   for (int b = 0; b < kBlocks; ++b) {
     const int64_t reach = list_block(p.masks + tile.begin, tile.count, b, tile.list);
@@ -221,11 +221,11 @@ void blend_tile(const Tile<T> &tile) {
 
 }  // namespace
 
-int64_t blend_scratch(const Pass<T> &p, int64_t list_length) {
+int64_t rasterize_forward_scratch(const Pass<T> &p, int64_t list_length) {
   return list_length * kRecord + kMaxChains * kWeightsAhead * kLanes + p.channels * kLanes;
 }
 
-void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
+void rasterize_forward(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
   const int64_t begin = p.tile_begin[index], count = p.tile_begin[index + 1] - begin;
   Carver<T> carver{scratch};
   T *records = carver.take(count * kRecord);
@@ -233,9 +233,9 @@ void blend(const Pass<T> &p, int64_t index, T *scratch, uint32_t *list) {
   T *weights = carver.take(kMaxChains * kWeightsAhead * kLanes);
   const Tile<T> tile{&p, index, begin, count, records, list, weights, carver.take(p.channels * kLanes)};
   if (p.chains == 1)
-    p.stop_before ? blend_tile<T, 1, true>(tile) : blend_tile<T, 1, false>(tile);
+    p.stop_before ? rasterize_tile<T, 1, true>(tile) : rasterize_tile<T, 1, false>(tile);
   else
-    p.stop_before ? blend_tile<T, 2, true>(tile) : blend_tile<T, 2, false>(tile);
+    p.stop_before ? rasterize_tile<T, 2, true>(tile) : rasterize_tile<T, 2, false>(tile);
 }
 
 }  // namespace vlgs::VLGS_ISA_NS
