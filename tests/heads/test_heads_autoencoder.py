@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vlgs.data.synthetic.language import vocabulary
-from vlgs.heads import Head
+from vlgs.heads import FittedHead, Head
 from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
+from vlgs.heads.identity import Identity
 
 CITYSCAPES = Path(__file__).parents[2] / (
     "../shared/data/clip_text_embeddings/semivl/cityscapes_single.npy"
@@ -283,3 +284,15 @@ def test_of_many_embeddings_a_part_is_measured(monkeypatch: pytest.MonkeyPatch):
     assert max(seen) == 60  # every fifth of 300
     every = (head.decode(encode(head, vectors)) * vectors).sum(dim=1)
     assert head.reconstruction == pytest.approx((areas @ every / areas.sum()).item(), abs=0.03)
+
+
+def test_a_rehearsal_is_short_and_leaves_no_cache(tmp_path: Path):
+    head = Autoencoder(training=QUICK, cache_dir=tmp_path)
+    assert isinstance(head, FittedHead)
+    assert not isinstance(Identity(3), FittedHead)
+    head.rehearse(2)
+    assert head.fit_settings.steps == 2
+    head.rehearse(5)
+    assert head.fit_settings.steps == 2
+    head.fit(cone(4), torch.ones(4))
+    assert not any(tmp_path.iterdir())

@@ -11,8 +11,10 @@ from time import thread_time
 import torch
 from torch import Tensor
 
+from vlgs import losses
 from vlgs.bench.iteration import SIZES, IterationSize, make_module
 from vlgs.fields.splat import SplatModel
+from vlgs.fusion import require_channels
 from vlgs.fusion.attention import SelfAttention
 from vlgs.gaussians.logistic import logistic
 from vlgs.gaussians.sh import sh_to_rgb
@@ -67,13 +69,13 @@ def written_out(module: VLGSModule, step: int) -> Tensor:
 
     seen = [render(target.view.camera, with_color=True) for target in (first, second)]
     errors = [
-        l1_dssim._on_cpu(image, target.image, None, L1_SHARE)
+        _l1_dssim(image, target.image)
         for (image, _), target in zip(seen, (first, second), strict=True)
     ]
     total = errors[0] + errors[1]
     for (_, codes), target in zip(seen, (first, second), strict=True):
         assert target.codes is not None
-        total = total + squared_error._on_cpu(codes, target.codes, target.valid, "valid")
+        total = total + _squared_error(codes, target.codes, target.valid)
     between = setup.objectives["blended_view"]
     assert isinstance(between, BlendedView)
     weight = between.weight * setup.views.similarity(*pair)
@@ -83,7 +85,7 @@ def written_out(module: VLGSModule, step: int) -> Tensor:
         k, camera = between.between.at(step)
         mixed = blend_targets(first.codes, first.valid, second.codes, second.valid, k, setup.blend)
         (codes,) = render(camera, with_color=False)
-        total = total + weight * squared_error._on_cpu(codes, *mixed, "valid")
+        total = total + weight * _squared_error(codes, *mixed)
     return total
 
 
@@ -150,9 +152,21 @@ def _require_same(module: VLGSModule) -> None:
 def _fuse(model: SplatModel, color: Tensor, feature: Tensor) -> tuple[Tensor, Tensor]:
     fusion = model.fusion
     assert isinstance(fusion, SelfAttention)
+    require_channels("SelfAttention", color, feature, fusion.widths)
     qkv, out, token = fusion.qkv, fusion.out, fusion.token
     inner = out.in_features
     weights, biases = (t.split([inner, 2 * inner]) for t in (qkv.weight, qkv.bias))
     layers = (weights[0], biases[0], weights[1], biases[1], out.weight, out.bias)
     fused = attention._on_cpu(color, feature, token, layers, mixes_color=True)
     return fused[0], fused[1]
+
+
+def _l1_dssim(image: Tensor, photograph: Tensor) -> Tensor:
+    losses._require_shapes("l1_dssim", image, photograph)
+    losses._require_pixels("l1_dssim", image)
+    return l1_dssim._on_cpu(image, photograph, None, L1_SHARE)
+
+
+def _squared_error(codes: Tensor, wanted: Tensor, valid: Tensor | None) -> Tensor:
+    losses._require_shapes("masked_mse", codes, wanted, valid)
+    return squared_error._on_cpu(codes, wanted, valid, "valid")
