@@ -64,7 +64,7 @@ class Attribute:
         if self.activation == "unit":
             return raw / (torch.linalg.vector_norm(raw, dim=-1, keepdim=True) + SHORTEST)
         if self.activation == "sparse":
-            return largest(raw.softmax(dim=-1), self.kept)
+            return sparse_softmax(raw, self.kept)
         return logistic(raw) if self.activation == "logistic" else raw
 
     def first(self, count: int) -> Tensor:
@@ -83,18 +83,19 @@ class Attribute:
         return tuple(f"{self.columns}_{index}" for index in range(width))
 
 
-def largest(weights: Float[Tensor, "*n k"], kept: int) -> Float[Tensor, "*n k"]:
-    """The largest weights of each row, divided by their sum; zero for all others, which get no gradient either.
+def sparse_softmax(logits: Float[Tensor, "*n k"], kept: int) -> Float[Tensor, "*n k"]:
+    """The largest weights of a softmax, divided by their sum; all others are zero.
 
-    Of equal weights those of lower index are kept, so that equal rows stay equal.
+    That is the softmax of the largest logits alone, which is how it is computed: by way of all weights, those that are left out would
+    get gradients of rounding errors, from which Adam makes steps of full size. Of equal logits the first are kept.
 
     Example:
-        >>> largest(torch.tensor([0.1, 0.2, 0.3, 0.4]), kept=2)
+        >>> sparse_softmax(torch.tensor([0.1, 0.2, 0.3, 0.4]).log(), kept=2)
         tensor([0.0000, 0.0000, 0.4286, 0.5714])
     """
-    order = weights.detach().argsort(dim=-1, descending=True, stable=True)[..., :kept]
-    chosen = torch.zeros_like(weights).scatter(-1, order, weights.gather(-1, order))
-    return chosen / chosen.sum(dim=-1, keepdim=True)
+    order = logits.detach().argsort(dim=-1, descending=True, stable=True)[..., :kept]
+    weights = logits.gather(-1, order).softmax(dim=-1)
+    return torch.zeros_like(logits).scatter(-1, order, weights)
 
 
 Attributes = Mapping[str, Attribute]

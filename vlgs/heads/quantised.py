@@ -181,5 +181,5 @@ def quantiser_loss(
     errors = [
         w * (1 - table.gather(1, nearest).mean()) for w, table in zip(weights, cosines, strict=True)
     ]
-    used = torch.bincount(nearest[:, 0], minlength=fit.shape[1]) / len(fit)
+    used = torch.bincount(nearest[:, 0], minlength=fit.shape[1]).to(fit) / len(fit)
     return torch.stack(errors).sum() + balance * (used @ fit.softmax(dim=1).mean(dim=0))

@@ -1,13 +1,19 @@
 """Language by a table of embeddings: the four terms of GOI (Qu et al., ACM MM 2024)."""
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
+from torch.utils.checkpoint import checkpoint
 
 from vlgs.heads.lookup import LookupTable
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import masked_codes
 from vlgs.values import require_range
+
+
+CHUNK = 8192
+"""Pixels whose scores are held at once: 10 MB of 300."""
 
 
 class LookupLanguage(Objective):
@@ -87,22 +93,39 @@ class LookupLanguage(Objective):
     ) -> dict[str, Float[Tensor, ""]]:
         """The four terms for pixels with these codes and masks, weighted; p is at least 1."""
         rows, which, counts = masks.unique(return_inverse=True, return_counts=True)
-        share = counts / len(masks)
+        share = (counts / len(masks)).to(codes)
         wanted = normalize(self.views.codes_of(rows), dim=-1)
         cosines = wanted @ normalize(self.head.table, dim=-1).T  # [masks, rows]
         nearest = cosines.detach().argmax(dim=-1)
-        scores = self.head.predict(codes)
+        error, best = self._choose(codes, nearest[which])
         odds = (temperature * cosines).log_softmax(dim=-1)
         return {
-            "choice": self.choice * _choice(scores, nearest[which]),
+            "choice": self.choice * error,
             "near": 1 - share @ cosines.amax(dim=-1),
             "entropy": -self.entropy * (share @ (odds.exp() * odds).sum(dim=-1)),
-            "answer": 1 - cosines[which, scores.detach().argmax(dim=-1)].mean(),
+            "answer": 1 - cosines[which, best].mean(),
         }
 
+    def _choose(
+        self, codes: Float[Tensor, "p d"], right: Int[Tensor, " p"]
+    ) -> tuple[Float[Tensor, ""], Int[Tensor, " p"]]:
+        """The error of the choice, and the rows that are chosen; the scores of a view would be a hundred megabytes, and are not kept."""
+        parts = [
+            checkpoint(self._choose_some, *some, use_reentrant=False, preserve_rng_state=False)
+            for some in zip(codes.split(CHUNK), right.split(CHUNK), strict=True)
+        ]
+        errors, best = zip(*parts, strict=True)
+        return torch.stack(errors).sum() / (len(codes) * len(self.head.table)), torch.cat(best)
 
-def _choice(scores: Float[Tensor, "p k"], right: Int[Tensor, " p"]) -> Float[Tensor, ""]:
-    """Mean squared error of the softmax and the unit vectors of what is right, ``|s|^2 - 2 s_right + 1``: no map of those is made."""
+    def _choose_some(
+        self, codes: Float[Tensor, "c d"], right: Int[Tensor, " c"]
+    ) -> tuple[Float[Tensor, ""], Int[Tensor, " c"]]:
+        scores = self.head.predict(codes)
+        return choice_error(scores, right), scores.detach().argmax(dim=-1)
+
+
+def choice_error(scores: Float[Tensor, "p k"], right: Int[Tensor, " p"]) -> Float[Tensor, ""]:
+    """Sum of the squared errors of the softmax and the unit vectors of what is right, ``|s|^2 - 2 s_right + 1``: none of those is made."""
     odds = scores.softmax(dim=-1)
     errors = odds.square().sum(dim=-1) - 2 * odds.gather(1, right[:, None])[:, 0] + 1
-    return errors.mean() / scores.shape[1]
+    return errors.sum()

@@ -123,7 +123,7 @@ class Hyperplane:
         if bias is None:
             means = [(products @ n) / n.sum().clamp_min(1) for n in (inside, outside)]
             bias = -float(means[0] + means[1]) / 2
-        offset, total = torch.tensor(bias), inside.sum() + outside.sum()
+        offset = torch.tensor(bias)
         best, best_overlap = (weights.clone(), float(offset)), -1.0
         for _ in range(self.steps + 1):
             distance = rows @ weights + offset
@@ -132,11 +132,18 @@ class Hyperplane:
                 best, best_overlap = (weights.clone(), float(offset)), overlap
             if overlap >= self.overlap:
                 break
-            # Slope of mean max(0, 1 - y d), with y = 1 inside and -1 outside.
-            slope = (outside * (distance > -1) - inside * (distance < 1)) / total
+            slope = hinge_slope(distance, inside, outside)
             weights = weights - self.learning_rate * (slope @ rows)
             offset = offset - self.learning_rate * slope.sum()
         return Plane(best[0] / self.scale, best[1]), best_overlap
+
+
+def hinge_slope(
+    distance: Float[Tensor, " r"], inside: Float[Tensor, " r"], outside: Float[Tensor, " r"]
+) -> Float[Tensor, " r"]:
+    """Gradient of the mean of ``max(0, 1 - d)`` inside and ``max(0, 1 + d)`` outside by the distances d; counts say how often each is there."""
+    slope = outside * (distance > -1) - inside * (distance < 1)
+    return slope / (inside.sum() + outside.sum())
 
 
 def _mask_of(scene: Scene, word: Float[Tensor, " e"]) -> tuple[int, Bool[Tensor, "h w"]] | None:
