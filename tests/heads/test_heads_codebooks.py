@@ -10,6 +10,8 @@ from vlgs.heads.clusters import clusters
 from vlgs.heads.codebook import Codebook
 from vlgs.heads.lookup import LookupTable
 from vlgs.heads.quantised import QuantisedCodes, QuantiserTraining, quantise, quantiser_loss
+from vlgs.heads.rows import linear_rows
+from vlgs.objectives.lookup import choice_error
 
 WIDTH = 16
 
@@ -50,6 +52,23 @@ def test_clusters_need_no_thread_and_no_enough_vectors():
     assert (one @ vectors.T).amax(dim=1).min() > 1 - 1e-6
     with pytest.raises(ValueError, match="vectors must be finite and at least 1, got 0"):
         clusters(vectors[:0], 2)
+
+
+def test_maps_of_many_rows_have_the_same_bits_on_any_number_of_threads():
+    rows, weight, bias = torch.randn(3000, 10), torch.randn(300, 10), torch.randn(300)
+    torch.testing.assert_close(linear_rows(rows, weight, bias), rows @ weight.T + bias)
+    torch.testing.assert_close(linear_rows(rows[:1, None], weight), (rows[:1] @ weight.T)[:, None])
+    assert linear_rows(rows[:0], weight, bias).shape == (0, 300)
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            inputs = [value.clone().requires_grad_() for value in (rows, weight, bias)]
+            errors = choice_error(linear_rows(*inputs), torch.arange(3000) % 300)
+            found.append(torch.autograd.grad(errors, inputs))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))  # fmt: skip
 
 
 def test_the_codebook_of_langsplat_v2():

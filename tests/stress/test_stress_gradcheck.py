@@ -36,6 +36,7 @@ from vlgs.heads.identity import Identity
 from vlgs.heads.linear import Linear
 from vlgs.heads.lookup import LookupTable
 from vlgs.heads.quantised import QuantisedCodes, quantiser_loss
+from vlgs.heads.rows import layers, linear_rows
 from vlgs.indicator import Learned, Opacity, PerLevel
 from vlgs.losses import (
     l1_dssim,
@@ -367,6 +368,10 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.gaussians.attributes.sparse_softmax": lambda: (partial(sparse_softmax, kept=2), [draw(4, 5)]),
     "vlgs.gaussians.attributes.Attribute.activate of sparse codes": lambda: (
         replace(STANDARD["features"], activation="sparse", kept=2, parts=2).activate, [draw(4, 8)]
+    ),
+    "vlgs.heads.rows.linear_rows": lambda: (linear_rows, [draw(2, 3, 4), draw(2, 4, seed=1), draw(2, seed=2)]),
+    "vlgs.heads.rows.layers": lambda: (
+        partial(layers, nn.Sequential(nn.Linear(3, 4), nn.ReLU(), nn.Linear(4, 2)).double()), [draw(5, 3)]
     ),
     "vlgs.heads.codebook.Codebook.targets": lambda: (Codebook(2, 3).targets, [draw(4, 3)]),
     "vlgs.heads.codebook.Codebook.predict": lambda: codebook("predict"),

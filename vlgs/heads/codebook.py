@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vlgs.heads.clusters import clusters
+from vlgs.heads.rows import linear_rows
 from vlgs.values import require_range
 
 
@@ -60,7 +61,7 @@ class Codebook(nn.Module):
 
     def predict(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """Embeddings of any length."""
-        return codes @ self.entries
+        return linear_rows(codes, self.entries.T)
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; `predict` at unit length."""

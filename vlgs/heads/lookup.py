@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 
 from vlgs.heads.clusters import clusters
 from vlgs.heads.codebook import require_width
+from vlgs.heads.rows import linear_rows
 from vlgs.values import require_range
 
 
@@ -72,7 +73,7 @@ class LookupTable(nn.Module):
 
     def predict(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b rows"]:
         """A score for each row, before the softmax."""
-        return self.map(codes)
+        return linear_rows(codes, self.map.weight, self.map.bias)
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; one row of the table, never a mixture of several."""

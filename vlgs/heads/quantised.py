@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, one_hot
 
 from vlgs.heads.codebook import require_width
+from vlgs.heads.rows import layers
 from vlgs.heads.threads import one_thread
 from vlgs.values import require_range
 
@@ -19,7 +20,7 @@ class QuantiserTraining:
     """How the codebook is fitted: AdamW on masks drawn by their areas."""
 
     steps: int = 2000
-    batch: int = 1024
+    batch: int = 256
     learning_rate: float = 1e-4
     weight_decay: float = 0.01
     balance: float = 1.0
@@ -103,7 +104,7 @@ class QuantisedCodes(nn.Module):
 
     def predict(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b k"]:
         """A score for each entry, before the softmax."""
-        return self.classifier(normalize(codes, dim=-1, eps=1e-6))
+        return layers(self.classifier, normalize(codes, dim=-1, eps=1e-6))
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; the mean entry, at unit length."""

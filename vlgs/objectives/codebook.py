@@ -4,6 +4,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from vlgs.heads.codebook import Codebook
+from vlgs.heads.rows import linear_rows
 from vlgs.losses import RENDER_FLOOR, TARGET_FLOOR
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import masked_codes
@@ -62,6 +63,8 @@ class CodebookLanguage(Objective):
         rows, which = masks.unique(return_inverse=True)
         wanted = self.views.codes_of(rows)
         wanted = wanted / wanted.norm(dim=-1, keepdim=True).clamp_min(TARGET_FLOOR)
-        products = (codes * (wanted @ entries.T)[which]).sum(dim=-1)
-        squares = (codes * (codes @ (entries @ entries.T))).sum(dim=-1)
+        # Of all masks of the view, one is taken for each pixel; to take the products' other side by mask would need a gradient that
+        # threads add up in any order.
+        products = linear_rows(codes, linear_rows(wanted, entries)).gather(1, which[:, None])[:, 0]
+        squares = (codes * linear_rows(codes, linear_rows(entries, entries))).sum(dim=-1)
         return (1 - products / squares.clamp_min(RENDER_FLOOR**2).sqrt()).sum()

@@ -7,10 +7,10 @@ from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
 from vlgs.heads.lookup import LookupTable
+from vlgs.heads.rows import linear_rows
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import masked_codes
 from vlgs.values import require_range
-
 
 CHUNK = 8192
 """Pixels whose scores are held at once: 10 MB of 300."""
@@ -94,16 +94,19 @@ class LookupLanguage(Objective):
         """The four terms for pixels with these codes and masks, weighted; p is at least 1."""
         rows, which, counts = masks.unique(return_inverse=True, return_counts=True)
         share = (counts / len(masks)).to(codes)
+        size = len(self.head.table)
         wanted = normalize(self.views.codes_of(rows), dim=-1)
-        cosines = wanted @ normalize(self.head.table, dim=-1).T  # [masks, rows]
+        cosines = linear_rows(wanted, normalize(self.head.table, dim=-1))  # [masks, rows]
         nearest = cosines.detach().argmax(dim=-1)
         error, best = self._choose(codes, nearest[which])
+        # How often a mask of the view is answered by a row. A sum over pixels would have a gradient that threads add up in any order.
+        chosen = torch.bincount(which * size + best, minlength=cosines.numel()).view_as(cosines)
         odds = (temperature * cosines).log_softmax(dim=-1)
         return {
             "choice": self.choice * error,
             "near": 1 - share @ cosines.amax(dim=-1),
             "entropy": -self.entropy * (share @ (odds.exp() * odds).sum(dim=-1)),
-            "answer": 1 - cosines[which, best].mean(),
+            "answer": 1 - (cosines * chosen).sum() / len(masks),
         }
 
     def _choose(
@@ -126,6 +129,8 @@ class LookupLanguage(Objective):
 
 def choice_error(scores: Float[Tensor, "p k"], right: Int[Tensor, " p"]) -> Float[Tensor, ""]:
     """Sum of the squared errors of the softmax and the unit vectors of what is right, ``|s|^2 - 2 s_right + 1``: none of those is made."""
-    odds = scores.softmax(dim=-1)
+    odds = scores.log_softmax(
+        dim=-1
+    ).exp()  # the gradient of softmax has other bits on more threads
     errors = odds.square().sum(dim=-1) - 2 * odds.gather(1, right[:, None])[:, 0] + 1
     return errors.sum()

@@ -5,6 +5,7 @@ from itertools import pairwise
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from vlgs.heads.rows import layers
 from vlgs.objectives.code_classes import require_attribute
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.values import require_range
@@ -77,7 +78,7 @@ class SmoothCodes(nn.Module, Objective):
         self, means: Float[Tensor, "n 3"], codes: Float[Tensor, "n d"], doubt: Float[Tensor, " n"]
     ) -> dict[str, Float[Tensor, ""]]:
         """What the network and what the codes are told."""
-        answer = self.network(means.detach())
+        answer = layers(self.network, means.detach())
         pull = doubt.detach() + self.floor * (1 - doubt.detach())
         return {
             "smooth network": (answer - codes.detach()).square().mean(),
