@@ -7,8 +7,8 @@ from typing import Any
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.identity import RESULTS_VERSION
 from vlgs.prepare import Prepared
-from vlgs.query import TextEncoder
-from vlgs.report.evaluate import evaluate
+from vlgs.query import Learning, TextEncoder
+from vlgs.report.evaluate import evaluate, prompts_of
 from vlgs.report.pictures import write_pictures
 from vlgs.report.provenance import commit, machine
 from vlgs.report.results import write_metrics, write_queries
@@ -45,6 +45,9 @@ def report(
         for made in workshop.kept
         if write_point_cloud(made.folder.ply, made.field, cameras)
     ]
+    words, _ = prompts_of(scene, query, text)
+    if isinstance(query, Learning) and words is not None:
+        field = query.learn(field, scene, words)
     evaluation = evaluate(field, scene, query, text, experiment.protocol)
     asked = questions_of(field, scene, query, text)
     prompts = asked.prompts if asked else None

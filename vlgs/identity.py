@@ -65,6 +65,7 @@ GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
     "gaussians.codes": "none",
+    "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "stages": None,

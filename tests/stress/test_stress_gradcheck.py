@@ -11,10 +11,12 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd import gradcheck
 
 from tests.stress.splats import SMOOTH, make_splats
@@ -23,14 +25,18 @@ from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.blocks import BLOCK, from_blocks, linear, to_blocks
 from vlgs.fusion.mlp import MLP
-from vlgs.gaussians.attributes import STANDARD
+from vlgs.gaussians.attributes import STANDARD, sparse_softmax
 from vlgs.gaussians.logistic import logistic
 from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.heads.autoencoder import Autoencoder
+from vlgs.heads.codebook import Codebook
 from vlgs.heads.identity import Identity
 from vlgs.heads.linear import Linear
+from vlgs.heads.lookup import LookupTable
+from vlgs.heads.quantised import QuantisedCodes, quantiser_loss
+from vlgs.heads.rows import layers, linear_rows
 from vlgs.indicator import Learned, Opacity, PerLevel
 from vlgs.losses import (
     l1_dssim,
@@ -40,7 +46,8 @@ from vlgs.losses import (
     ssim,
     ssim_map,
 )
-from vlgs.objectives import Language
+from vlgs.objectives import CodebookLanguage, CodeClasses, Language, LookupLanguage
+from vlgs.objectives.lookup import choice_error
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
@@ -63,10 +70,19 @@ NO_GRADIENT = {
     "vlgs.heads.Head.decode": "protocol",
     **{f"vlgs.objectives.{name}": "adds up the losses and renders that are checked" for name in (
         "objective.Objective.__call__", "photometric.Photometric.__call__", "language.Language.__call__",
-        "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss",
+        "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss", "code_classes.CodeClasses.__call__",
+        "codebook.CodebookLanguage.__call__", "lookup.LookupLanguage.__call__", "smooth_codes.SmoothCodes.__call__",
     )},
+    "vlgs.objectives.smooth_codes.SmoothCodes.terms": "each term leaves one side where it is (tests/objectives)",
+    "vlgs.objectives.targets.masked_codes": "picks pixels",
+    "vlgs.objectives.targets.TrainingViews.codes_of": "picks rows of what is not trained",
     "vlgs.objectives.targets.covered": "a mask",
+    "vlgs.gaussians.attributes.Attribute.first": "before training",
     "vlgs.gaussians.parameters.at_levels": "before training",
+    "vlgs.heads.clusters.clusters": "before training",
+    "vlgs.heads.lookup.LookupTable.decode": "picks rows, after training",
+    "vlgs.heads.quantised.QuantisedCodes.targets": "picks rows",
+    "vlgs.heads.quantised.quantise": "before training",
     "vlgs.gaussians.parameters.complete": "before training",
     "vlgs.gaussians.parameters.conform": "before training",
     "vlgs.query.Query.relevancy": "protocol",
@@ -90,6 +106,12 @@ NO_GRADIENT = {
         "HasGaussians.gaussian_similarity", "HasGaussians.render_values",
     )},
     "vlgs.fields.gaussians_of": "returns its argument",
+    "vlgs.fields.planes.PlaneField.similarity": "training is over",
+    **{f"vlgs.fields.planes.PlaneGaussians.{name}": "training is over" for name in (
+        "opacities", "language_weights", "gaussian_similarity", "render_values",
+    )},
+    **{f"vlgs.query.hyperplane.Hyperplane.{name}": "training is over" for name in ("relevancy", "__call__")},
+    "vlgs.query.hyperplane.hinge_slope": "a gradient itself",
     **{f"vlgs.fields.trained.SplatField.{name}": "training is over" for name in (
         "similarity", "opacities", "language_weights", "gaussian_similarity", "render_values",
     )},
@@ -233,11 +255,46 @@ def linear_head(name: str) -> Check:
     return run, [draw(2, 3, 3), draw(4, 3, seed=1), draw(4, seed=2)]
 
 
+def bound(objective: Any, head: nn.Module) -> Any:
+    """An objective that sees five masks and a head in float64."""
+    masks = SimpleNamespace(codes_of=lambda rows: draw(5, 4, seed=5)[rows])
+    objective.head, objective.views = head.double(), masks
+    return objective
+
+
+def codebook(name: str) -> Check:
+    """By codes and entries."""
+    made = Codebook(dim=3, width=4).double()
+    del made.entries  # they are an input here
+
+    def run(codes: Tensor, entries: Tensor):
+        made.__dict__["entries"] = entries
+        if name == "total":
+            return bound(CodebookLanguage(), made).total(codes, torch.tensor([0, 3, 0, 1, 4, 1]))
+        return getattr(made, name)(codes)
+
+    return run, [draw(6, 3), draw(3, 4, seed=1)]
+
+
 def head() -> Autoencoder:
     made = Autoencoder(dim=3, encoder_widths=(8, 6), decoder_widths=(6, 8))
     torch.manual_seed(0)
     made.build(5)
     made.requires_grad_(False)
+    return made.double()
+
+
+def lookup() -> LookupTable:
+    torch.manual_seed(0)
+    made = LookupTable(dim=2, rows=3, width=4)
+    made.fit(draw(3, 4).float(), torch.ones(3))
+    return made
+
+
+def quantised() -> QuantisedCodes:
+    torch.manual_seed(0)
+    made = QuantisedCodes(dim=2, entries=3, width=4, hidden=[5])
+    made.codebook = draw(3, 4)
     return made.double()
 
 
@@ -308,6 +365,36 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.fusion.attention.SelfAttention.forward of two heads": lambda: fuse(SelfAttention(2, 2, 1, 2, "xavier")),
     "vlgs.fusion.attention.CrossAttention.forward of two heads": lambda: fuse(CrossAttention(2, 2, 1, 2, "xavier")),
     "vlgs.fusion.mlp.MLP.forward": lambda: fuse(MLP(2, 2, residual=False)),
+    "vlgs.gaussians.attributes.sparse_softmax": lambda: (partial(sparse_softmax, kept=2), [draw(4, 5)]),
+    "vlgs.gaussians.attributes.Attribute.activate of sparse codes": lambda: (
+        replace(STANDARD["features"], activation="sparse", kept=2, parts=2).activate, [draw(4, 8)]
+    ),
+    "vlgs.heads.rows.linear_rows": lambda: (linear_rows, [draw(2, 3, 4), draw(2, 4, seed=1), draw(2, seed=2)]),
+    "vlgs.heads.rows.layers": lambda: (
+        partial(layers, nn.Sequential(nn.Linear(3, 4), nn.ReLU(), nn.Linear(4, 2)).double()), [draw(5, 3)]
+    ),
+    "vlgs.heads.codebook.Codebook.targets": lambda: (Codebook(2, 3).targets, [draw(4, 3)]),
+    "vlgs.heads.codebook.Codebook.predict": lambda: codebook("predict"),
+    "vlgs.heads.codebook.Codebook.decode": lambda: codebook("decode"),
+    "vlgs.heads.lookup.LookupTable.targets": lambda: (LookupTable(2, 3, 4).targets, [draw(4, 4)]),
+    "vlgs.heads.lookup.LookupTable.predict": lambda: (LookupTable(2, 3, 4).double().predict, [draw(4, 2)]),
+    "vlgs.heads.quantised.QuantisedCodes.predict": lambda: (QuantisedCodes(2, 3, 4, [5]).double().predict, [draw(4, 2)]),
+    "vlgs.heads.quantised.QuantisedCodes.decode": lambda: (quantised().decode, [draw(4, 2)]),
+    "vlgs.heads.quantised.quantiser_loss": lambda: (
+        lambda a, b: quantiser_loss([a, b], [1.0, 0.5], 2.0), [draw(6, 3), draw(6, 3, seed=1)]
+    ),
+    "vlgs.objectives.codebook.CodebookLanguage.total": lambda: codebook("total"),
+    "vlgs.objectives.lookup.LookupLanguage.terms": lambda: (
+        lambda codes: tuple(bound(LookupLanguage(), lookup()).terms(codes, torch.tensor([0, 3, 0, 1]), 2.0).values()),
+        [draw(4, 2)],
+    ),
+    "vlgs.objectives.lookup.choice_error": lambda: (
+        lambda scores: choice_error(scores, torch.tensor([2, 0, 2])), [draw(3, 4)]
+    ),
+    "vlgs.objectives.code_classes.CodeClasses.terms": lambda: (
+        lambda codes, doubt: bound(CodeClasses(), quantised()).terms(codes, torch.eye(3).double(), doubt),
+        [draw(3, 2), draw(3, low=0.1, high=0.9)],
+    ),
     "vlgs.heads.linear.Linear.targets": lambda: (Linear(2, 3).targets, [draw(4, 3)]),
     "vlgs.heads.linear.Linear.predict": lambda: linear_head("predict"),
     "vlgs.heads.linear.Linear.decode": lambda: linear_head("decode"),

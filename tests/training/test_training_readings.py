@@ -129,7 +129,7 @@ def test_pairs_of_neighbours(tiny_scene: Scene):
         ("gaussians.color=hsv", "color must be one of rgb_dc, rgb, evaluated, got 'hsv'"),
         (
             "gaussians.init_features=random",
-            "init_features must be one of zero, lifted, got 'random'",
+            "init_features must be one of zero, lifted, normal, got 'random'",
         ),
         ("blend.kept=second", "kept must be one of first, nearer, got 'second'"),
         ("blend.pairs=near", "pairs must be one of uniform, neighbours, got 'near'"),

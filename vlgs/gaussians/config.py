@@ -7,8 +7,11 @@ from typing import Any, Literal, get_args
 from vlgs.demands import Demand
 from vlgs.values import require_choice, require_range
 
-Activation = Literal["none", "exp", "logistic", "unit"]
-"""From a raw parameter to natural units; ``unit`` is the direction of a vector."""
+Activation = Literal["none", "exp", "logistic", "unit", "sparse"]
+"""From a raw parameter to natural units; ``unit`` is the direction of a vector, ``sparse`` its softmax of which only the largest weights
+are kept."""
+Start = float | Literal["normal"]
+"""Raw value of all Gaussians at the start; ``normal``: drawn from N(0, 1), as the run's seed says."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,7 @@ class AttributeConfig:
     """How many numbers a Gaussian has of it."""
     activation: Activation = "none"
     """From the raw parameter to what is drawn."""
-    start: float = 0.0
-    """Raw value of all Gaussians at the start."""
+    start: Start = 0.0
     rate: float = 2.5e-3
     """Adam's rate; 0: it does not learn."""
     blended_by: Literal["opacity", "indicator"] | None = "opacity"
@@ -84,7 +86,10 @@ class AttributeConfig:
     def __post_init__(self) -> None:
         require_range("attribute", 1, 4096, width=self.width)
         require_range("attribute", 0, 1, rate=self.rate)
-        require_range("attribute", -1e6, 1e6, start=self.start)
+        if self.start != "normal":
+            if isinstance(self.start, str):
+                raise ValueError(f"attribute: start must be a number or normal, got {self.start!r}")
+            require_range("attribute", -1e6, 1e6, start=self.start)
         require_choice("attribute", "activation", self.activation, get_args(Activation))
         if self.blended_by is not None:
             require_choice("attribute", "blended_by", self.blended_by, ("opacity", "indicator"))
@@ -102,8 +107,9 @@ class GaussiansConfig:
     init_opacity: float = 0.1
     init_indicator: float = 0.1
     """The paper starts the indicator in the same manner as the opacity (its section 4.1)."""
-    init_features: Literal["zero", "lifted"] = "zero"
-    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`; conf/README.md, D.9)."""
+    init_features: Literal["zero", "lifted", "normal"] = "zero"
+    """Language codes at the start: zero, the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`;
+    conf/README.md, D.9), or drawn from N(0, 1), as LEGaussians'."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
@@ -123,8 +129,11 @@ class GaussiansConfig:
     """File of Gaussians to start from (`vlgs.formats.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"
     """Loss whose screen gradients feed densification (conf/README.md, D.11)."""
-    codes: Literal["none", "unit"] = "none"
-    """Activation of the language codes before they are blended: as they are, or at unit length, as LangSplat's."""
+    codes: Literal["none", "unit", "sparse"] = "none"
+    """Activation of the language codes before they are blended: as they are, at unit length, as LangSplat's, or the weights of a few
+    entries of a codebook, as LangSplatV2's."""
+    codes_kept: int = 4
+    """How many weights ``codes=sparse`` keeps."""
     codes_shape_grad: bool = True
     """Whether the gradient of language reaches positions, rotations and scales; Feature-3DGS's, as released, does not."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -144,13 +153,14 @@ class GaussiansConfig:
         require_range("gaussians", 1, 10**9, max_count=self.max_count)
         require_range("gaussians", 0, 10**6, background=self.background)
         require_range("gaussians", 0, 1, silent_above=self.silent_above)
+        require_range("gaussians", 1, 65536, codes_kept=self.codes_kept)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),
-            "init_features": ("zero", "lifted"),
+            "init_features": ("zero", "lifted", "normal"),
             "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
-            "codes": ("none", "unit"),
+            "codes": ("none", "unit", "sparse"),
         }.items():
             require_choice("gaussians", name, getattr(self, name), options)
 
@@ -160,7 +170,7 @@ class GaussiansConfig:
     @property
     def demands(self) -> Sequence[Demand]:
         """Codes are there to be lifted where the head is fitted before."""
-        if self.init_features == "zero":
+        if self.init_features != "lifted":
             return ()
         why = "as codes of masks are lifted onto the Gaussians"
         return (Demand("gaussians.init_features=lifted", "head", "untrained", why),)

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from vlgs.gaussians.attributes import STANDARD, Attributes, Role
 from vlgs.gaussians.config import GaussiansConfig
-from vlgs.gaussians.init import distance_to_nearest, seeded_generator
+from vlgs.gaussians.draws import seeded_generator
+from vlgs.gaussians.init import distance_to_nearest
 from vlgs.gaussians.logistic import logit
 from vlgs.gaussians.parameters import Parameters
 from vlgs.geometry import quat_to_rotmat

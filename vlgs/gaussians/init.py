@@ -1,6 +1,5 @@
 """The first Gaussians of a scene: one per sparse point, or random ones where the cameras look."""
 
-import hashlib
 import logging
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from vlgs.gaussians.attributes import Attributes
 from vlgs.gaussians.config import GaussiansConfig
+from vlgs.gaussians.draws import seeded_generator
 from vlgs.gaussians.neighbors import mean_squared_distance
 from vlgs.gaussians.parameters import conform
 from vlgs.gaussians.sh import rgb_to_sh
@@ -74,15 +74,6 @@ def initialise(
         ].sort()[0]
         cloud = Cloud(cloud.points[kept], cloud.colors[kept])
     return parameters_of(cloud, _initial_scales(cloud.points, centers, config), attributes)
-
-
-def seeded_generator(purpose: str, seed: int, step: int) -> torch.Generator:
-    """A generator that depends on (purpose, seed, step) alone, so that a resumed run draws what it would have drawn.
-
-    The three are hashed because torch's generator for the CPU takes only the low 32 bits of its seed.
-    """
-    digest = hashlib.blake2b(f"{purpose}:{seed}:{step}".encode(), digest_size=4).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest, "little"))
 
 
 def parameters_of(

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -90,7 +89,7 @@ def at_levels(logits: Float[Tensor, "n ..."], levels: int | None) -> Float[Tenso
 def _started(row: Attribute, made: Mapping[str, Tensor], params: Parameters) -> Tensor:
     if isinstance(row.start, str):
         return (made[row.start] if row.start in made else params[row.start]).clone()
-    return torch.full((len(params["means"]), *(row.shape or ())), row.start)
+    return row.first(len(params["means"]))
 
 
 def _fitted(row: Attribute, value: Tensor) -> Tensor:
@@ -98,7 +97,7 @@ def _fitted(row: Attribute, value: Tensor) -> Tensor:
         return value
     if row.role == "weight":
         return at_levels(value, row.shape[0] if row.shape else None)
-    fresh = torch.full((len(value), *row.shape), float(row.start))
+    fresh = row.first(len(value))
     if len(row.shape) == 2 and value.dim() == 3:  # harmonics
         shared = min(row.shape[0], value.shape[1])
         fresh[:, :shared] = value[:, :shared]

@@ -18,8 +18,11 @@ class Head(Protocol):
 
     dim: int
     """Width d of the codes."""
-    learning_rate: float | None
-    """Adam's, for parameters that are trained along with the Gaussians; None: they are fitted before."""
+
+    @property
+    def learning_rate(self) -> float | Mapping[str, float] | None:
+        """Adam's, for parameters that are trained along with the Gaussians, or one for each part by its name; None: they are fitted before."""
+        ...
 
     def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
         """Prepare for one scene: learn all that is not trained along.

@@ -3,8 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vlgs.files import write_atomically
+from vlgs.heads.threads import one_thread
 from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
@@ -151,7 +151,7 @@ class Autoencoder(nn.Module):
         vectors, areas = _distinct(vectors.detach().float(), areas.detach().float())
         path = self._cache_path(vectors, areas)
         if path is None or not self._read_cache(path, vectors.shape[1]):
-            with _one_thread():
+            with one_thread():
                 self._fit(vectors, areas)
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -340,17 +340,6 @@ def _distinct(
     rows, group = torch.unique(vectors, dim=0, return_inverse=True)
     summed = torch.zeros(len(rows)).index_add_(0, group, areas)
     return normalize(rows, dim=-1), summed
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Run on one thread: matrices this small gain nothing from a second one, are slower on shared cores, and their last bits depend on the number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _checked_steps(steps: int) -> set[int]:

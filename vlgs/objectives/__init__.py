@@ -6,8 +6,23 @@ YAML file.
 """
 
 from vlgs.objectives.blended_view import BlendedView
+from vlgs.objectives.code_classes import CodeClasses
+from vlgs.objectives.codebook import CodebookLanguage
 from vlgs.objectives.language import Language
+from vlgs.objectives.lookup import LookupLanguage
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.photometric import Photometric
+from vlgs.objectives.smooth_codes import SmoothCodes
 
-__all__ = ["BlendedView", "Language", "Objective", "Photometric", "Setup", "StepView"]
+__all__ = [
+    "BlendedView",
+    "CodeClasses",
+    "CodebookLanguage",
+    "Language",
+    "LookupLanguage",
+    "Objective",
+    "Photometric",
+    "Setup",
+    "SmoothCodes",
+    "StepView",
+]

@@ -28,6 +28,8 @@ class Setup:
     blend_reuse: float
     counts: SkipCount
     """Where work that is left out is counted."""
+    iterations: int = 1
+    """How many there will be."""
 
 
 @dataclass(frozen=True)

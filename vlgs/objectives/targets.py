@@ -114,6 +114,14 @@ class TrainingViews:
         return sum(views) if sum(views) <= TARGET_BYTES else 2 * max(views)
 
 
+def masked_codes(
+    feature: Float[Tensor, "h w c"], target: Target
+) -> tuple[Float[Tensor, "p d"], Int[Tensor, " p"]]:
+    """The rendered codes of the pixels that have a mask, and the rows of their masks; mask levels of a pixel count one by one."""
+    valid = target.valid
+    return feature.view(*valid.shape, -1)[valid], target.masks[valid].long()
+
+
 def covered(view: View) -> Bool[Tensor, "h w"] | None:
     """Pixels that the photograph of a view covers; None for all."""
     return None if view.read_valid is None else view.read_valid()

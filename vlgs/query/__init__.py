@@ -6,12 +6,17 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields import Field
+from vlgs.query.hyperplane import Hyperplane
 from vlgs.query.prompts import Prompts, encode_prompts
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.query.text import TextEncoder
 from vlgs.query.words import Questions, encode_questions, words_of
+from vlgs.types import Scene
 
 __all__ = [
+    "Hyperplane",
+    "Learning",
     "LerfRelevancy",
     "Prompts",
     "Query",
@@ -55,4 +60,13 @@ class Query(Protocol):
         negatives: Float[Tensor, "m e"],
     ) -> Float[Tensor, " k *p"]:
         """Relevancy of k prompts for features of any length."""
+        ...
+
+
+@runtime_checkable
+class Learning(Protocol):
+    """What a query also is that learns from the training views of a scene what its words mean there."""
+
+    def learn(self, field: Field, scene: Scene, prompts: Prompts) -> Field:
+        """The same field, which answers these words as they were learned."""
         ...

@@ -106,7 +106,8 @@ def build_module(
     own = language and parts.sharing.own_shape
     several = has(parts.indicator, "each_level") and scene.mask_levels > 1
     levels = scene.mask_levels if several else None
-    attributes = attributes_of(config, width, levels, own, asdict(parts.trainer.learning_rates))
+    rates = asdict(parts.trainer.learning_rates)
+    attributes = attributes_of(config, width, levels, own, rates, scene.mask_levels, seed)
     if start is not None:
         parameters = conform(start, attributes)
     elif config.init is not None:
@@ -126,7 +127,9 @@ def build_module(
     )
     color = color or (start is not None and not has(fusion, "untrained"))
     objectives = {n: o for n, o in parts.loss.items() if color or "color" not in o.needs}
-    setup = bind(objectives, scene, model, parts.blend, parts.trainer.skip, seed)
+    setup = bind(
+        objectives, scene, model, parts.blend, parts.trainer.skip, seed, parts.trainer.iterations
+    )
     module = VLGSModule(model, setup, config, parts.trainer, seed)
     if config.init_features == "lifted":
         lift_features(module)
@@ -140,6 +143,7 @@ def bind(
     blend: ViewBlend,
     skip: SkipConfig,
     seed: int,
+    iterations: int = 1,
 ) -> Setup:
     """Show a scene to objectives, with the targets that the model's head makes of its masks."""
     cameras = [view.camera for view in scene.train]
@@ -151,7 +155,8 @@ def bind(
             codes = model.head.targets(scene.mask_vectors)
     counts = SkipCount()
     views = TrainingViews(scene, codes, sampler, counts)
-    setup = Setup(views, model, objectives, blend, skip.blend_weight, skip.blend_reuse, counts)
+    least, reuse = skip.blend_weight, skip.blend_reuse
+    setup = Setup(views, model, objectives, blend, least, reuse, counts, iterations)
     for objective in objectives.values():
         objective.bind(setup)
     return setup

@@ -1,12 +1,14 @@
 """Training as one LightningModule: schedule, one step, one Adam."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import lightning as L
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
@@ -17,6 +19,9 @@ from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
 from vlgs.training.exposure import Exposure
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
+
+Rate = float | Mapping[str, float]
+"""Adam's, or one for each part of a module."""
 
 
 @dataclass
@@ -131,11 +136,11 @@ class VLGSModule(L.LightningModule):
             if parameter.requires_grad
         ]
         given = self.settings.learning_rates
-        rates = {"fusion": given.fusion, "exposure": given.exposure}
+        rates: dict[str, Rate] = {"fusion": given.fusion, "exposure": given.exposure}
         rates |= {"head": self.model.head.learning_rate or 0.0}
         rates |= {f"loss.{name}": part.rate for name, part in self.step.setup.objectives.items()}
         for name, part in self.step.modules().items():
-            groups.append({"params": list(part.parameters()), "lr": rates[name], "name": name})
+            groups += _groups(name, part, rates[name])
         if not groups:
             raise ValueError("train: trainer.freeze must leave something to train, got everything")
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
@@ -170,3 +175,16 @@ class VLGSModule(L.LightningModule):
                 raise FloatingPointError(
                     f"train: {name} must be finite, got {tensor[row].tolist()} in row {row} {where}"
                 )
+
+
+def _groups(name: str, module: nn.Module, rate: Rate) -> list[dict[str, Any]]:
+    """Groups of the optimiser for what is trained beside the Gaussians: one, or one for each part that has a rate."""
+    if not isinstance(rate, Mapping):
+        return [{"params": list(module.parameters()), "lr": rate, "name": name}]
+    parts: dict[str, list[nn.Parameter]] = {part: [] for part in rate}
+    for own, parameter in module.named_parameters():
+        parts[own.partition(".")[0]].append(parameter)
+    return [
+        {"params": parameters, "lr": rate[part], "name": f"{name}.{part}"}
+        for part, parameters in parts.items()
+    ]

@@ -1,0 +1,48 @@
+"""Linear maps of many rows in blocks of fixed size, so that gradients have the same bits on any number of threads.
+
+One matrix product over all rows is cut by the BLAS library into as many parts as there are threads, and the gradient of a weight,
+a sum over all rows, then depends on their number. A batch of equal products is not cut any further.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+BLOCK = 512
+"""Rows of a block; of fewer than two blocks the halves."""
+
+
+def linear_rows(
+    rows: Float[Tensor, "*b i"],
+    weight: Float[Tensor, "o i"],
+    bias: Float[Tensor, " o"] | None = None,
+) -> Float[Tensor, "*b o"]:
+    """``W x + b`` for every row x.
+
+    Example:
+        >>> linear_rows(torch.ones(3, 2), torch.tensor([[1.0, 2.0]]), torch.tensor([0.5]))
+        tensor([[3.5000],
+                [3.5000],
+                [3.5000]])
+    """
+    flat = rows.reshape(-1, rows.shape[-1])
+    # A batch of one counts as a single product, which may be cut.
+    size = min(BLOCK, math.ceil(max(len(flat), 2) / 2))
+    count = max(2, math.ceil(len(flat) / size))
+    blocks = pad(flat, (0, 0, 0, count * size - len(flat))).unflatten(0, (count, size))
+    batch = weight.T.expand(count, -1, -1)
+    made = torch.bmm(blocks, batch) if bias is None else torch.baddbmm(bias, blocks, batch)
+    return made.flatten(0, 1)[: len(flat)].reshape(*rows.shape[:-1], len(weight))
+
+
+def layers(network: nn.Sequential, rows: Float[Tensor, "*b i"]) -> Float[Tensor, "*b o"]:
+    """A network of linear maps and what acts on each number by itself, by `linear_rows`."""
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            rows = linear_rows(rows, layer.weight, layer.bias)
+        else:
+            rows = layer(rows)
+    return rows

@@ -1,0 +1,136 @@
+"""Language by a table of embeddings: the four terms of GOI (Qu et al., ACM MM 2024)."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+from torch.utils.checkpoint import checkpoint
+
+from vlgs.heads.lookup import LookupTable
+from vlgs.heads.rows import linear_rows
+from vlgs.objectives.objective import Objective, Setup, StepView
+from vlgs.objectives.targets import masked_codes
+from vlgs.values import require_range
+
+CHUNK = 8192
+"""Pixels whose scores are held at once: 10 MB of 300."""
+
+
+class LookupLanguage(Objective):
+    """Codes learn to choose the row of a table that is nearest to the embedding of the mask, while the rows learn to be near.
+
+    Over the pixels that have a mask, with s the scores of a pixel (`vlgs.heads.lookup.LookupTable.predict`) and c its cosines with
+    all rows:
+
+    - ``choice``: squared error of softmax(s) and the unit vector of the nearest row, its mean over pixels and rows. It alone reaches
+      the codes.
+    - ``near``: ``1 - max c``.
+    - ``entropy``: of softmax(t c), so that a row is near to few embeddings; t doubles late in training.
+    - ``answer``: ``1 - c`` of the row that the scores choose.
+
+    All pixels of a mask have the same cosines, which are computed once for each mask of a view.
+
+    Args:
+        choice: Weight of the first term.
+        entropy: Weight of the third.
+        temperature: t at first.
+        late: Share of the iterations after which t is `late_temperature`.
+        late_temperature: t then.
+
+    Raises:
+        ValueError: If a weight is negative, or `late` is not in [0, 1].
+    """
+
+    needs = frozenset({"feature"})
+
+    def __init__(
+        self,
+        choice: float = 50.0,
+        entropy: float = 0.3,
+        temperature: float = 1.0,
+        late: float = 2 / 3,
+        late_temperature: float = 2.0,
+    ) -> None:
+        require_range("lookup language", 0, 1e6, choice=choice, entropy=entropy)
+        require_range("lookup language", 0, 1e6, temperature=temperature)
+        require_range("lookup language", 0, 1e6, late_temperature=late_temperature)
+        require_range("lookup language", 0, 1, late=late)
+        self.choice = choice
+        self.entropy = entropy
+        self.temperature = temperature
+        self.late = late
+        self.late_temperature = late_temperature
+
+    def bind(self, setup: Setup) -> None:
+        """The table is that of the head.
+
+        Raises:
+            ValueError: If the head has none.
+        """
+        head = setup.model.head
+        if not isinstance(head, LookupTable):
+            raise ValueError(
+                f"lookup language: head must be lookup, which has a table, got {type(head).__name__}"
+            )
+        self.head, self.views, self.iterations = head, setup.views, setup.iterations
+
+    def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
+        """The four terms of each view that has language."""
+        late = step.step >= self.late * self.iterations
+        temperature = self.late_temperature if late else self.temperature
+        terms: dict[str, Tensor] = {}
+        for place, render, target in zip("12", step.renders, step.targets, strict=True):
+            if render.feature is None or not target.has_language:
+                continue
+            codes, masks = masked_codes(render.feature, target)
+            if len(masks):
+                own = self.terms(codes, masks, temperature)
+                terms |= {f"{name} {place}": term for name, term in own.items()}
+        return terms
+
+    def terms(
+        self, codes: Float[Tensor, "p d"], masks: Int[Tensor, " p"], temperature: float
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The four terms for pixels with these codes and masks, weighted; p is at least 1."""
+        rows, which, counts = masks.unique(return_inverse=True, return_counts=True)
+        share = (counts / len(masks)).to(codes)
+        size = len(self.head.table)
+        wanted = normalize(self.views.codes_of(rows), dim=-1)
+        cosines = linear_rows(wanted, normalize(self.head.table, dim=-1))  # [masks, rows]
+        nearest = cosines.detach().argmax(dim=-1)
+        error, best = self._choose(codes, nearest[which])
+        # How often a mask of the view is answered by a row. A sum over pixels would have a gradient that threads add up in any order.
+        chosen = torch.bincount(which * size + best, minlength=cosines.numel()).view_as(cosines)
+        odds = (temperature * cosines).log_softmax(dim=-1)
+        return {
+            "choice": self.choice * error,
+            "near": 1 - share @ cosines.amax(dim=-1),
+            "entropy": -self.entropy * (share @ (odds.exp() * odds).sum(dim=-1)),
+            "answer": 1 - (cosines * chosen).sum() / len(masks),
+        }
+
+    def _choose(
+        self, codes: Float[Tensor, "p d"], right: Int[Tensor, " p"]
+    ) -> tuple[Float[Tensor, ""], Int[Tensor, " p"]]:
+        """The error of the choice, and the rows that are chosen; the scores of a view would be a hundred megabytes, and are not kept."""
+        parts = [
+            checkpoint(self._choose_some, *some, use_reentrant=False, preserve_rng_state=False)
+            for some in zip(codes.split(CHUNK), right.split(CHUNK), strict=True)
+        ]
+        errors, best = zip(*parts, strict=True)
+        return torch.stack(errors).sum() / (len(codes) * len(self.head.table)), torch.cat(best)
+
+    def _choose_some(
+        self, codes: Float[Tensor, "c d"], right: Int[Tensor, " c"]
+    ) -> tuple[Float[Tensor, ""], Int[Tensor, " c"]]:
+        scores = self.head.predict(codes)
+        return choice_error(scores, right), scores.detach().argmax(dim=-1)
+
+
+def choice_error(scores: Float[Tensor, "p k"], right: Int[Tensor, " p"]) -> Float[Tensor, ""]:
+    """Sum of the squared errors of the softmax and the unit vectors of what is right, ``|s|^2 - 2 s_right + 1``: none of those is made."""
+    odds = scores.log_softmax(
+        dim=-1
+    ).exp()  # the gradient of softmax has other bits on more threads
+    errors = odds.square().sum(dim=-1) - 2 * odds.gather(1, right[:, None])[:, 0] + 1
+    return errors.sum()
