@@ -97,13 +97,13 @@ def runner(monkeypatch: pytest.MonkeyPatch) -> Runner:
 @pytest.mark.parametrize("method", METHODS)
 def test_it_trains_stops_goes_on_and_comes_back(tmp_path: Path, runner: Runner, method: str):
     chosen = f"method={method}"
-    whole = runner(tmp_path / "whole", chosen)
+    whole = runner(tmp_path / "whole", chosen, "threads=2")
     require_scores(whole)
     require_field(whole)
 
     with pytest.raises(KilledError):
-        runner(tmp_path / "parts", chosen, last=max(1, len(whole.written) - 1))
-    parts = runner(tmp_path / "parts", chosen)
+        runner(tmp_path / "parts", chosen, "threads=1", last=max(1, len(whole.written) - 1))
+    parts = runner(tmp_path / "parts", chosen, "threads=1")
     assert parts.folder.path.name == whole.folder.path.name
     assert len(parts.written) < len(whole.written), "what was made is not made again"
     require_same(parts, whole)

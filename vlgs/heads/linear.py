@@ -4,6 +4,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.heads.rows import linear_rows
 from vlgs.values import require_range
 
 
@@ -53,7 +54,7 @@ class Linear(nn.Module):
 
     def predict(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """Embeddings of any length."""
-        return self.map(codes)
+        return linear_rows(codes, self.map.weight, self.map.bias)
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; `predict` at unit length."""
