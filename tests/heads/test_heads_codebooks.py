@@ -109,7 +109,7 @@ def test_the_quantiser_of_legaussians():
     layers = [tuple(p.shape) for p in head.parameters()]
     assert layers == [(128, 8), (128,), (256, 128), (256,), (32, 256), (32,)]
     assert head.codebook.shape == (32, 512)  # no parameter: it stays as it was fitted
-    small = QuantisedCodes(dim=2, entries=6, width=WIDTH, training=QuantiserTraining(steps=400, learning_rate=1e-3))  # fmt: skip
+    small = QuantisedCodes(dim=2, entries=6, width=WIDTH, quantiser=QuantiserTraining(steps=400, learning_rate=1e-3))  # fmt: skip
     vectors = things()
     small.fit(vectors, torch.ones(len(vectors)))
     targets = small.targets(vectors)

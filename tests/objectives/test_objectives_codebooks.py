@@ -40,7 +40,7 @@ def pixels(module: VLGSModule, count: int = 40):
 
 def test_langsplat_v2_is_one_minus_cos_whatever_way_it_is_computed(tiny_scene: Scene):
     module = module_of(tiny_scene, "langsplat_v2")
-    objective = module.step.setup.objectives["language"]
+    objective = module.step.setup.objectives["codebook"]
     assert isinstance(objective, CodebookLanguage)
     assert objective.pixels == "all"
     codes, masks, vectors = pixels(module)
@@ -149,7 +149,7 @@ def test_goi_reaches_codes_by_the_choice_and_the_table_by_the_rest(tiny_scene: S
 
 
 def test_the_terms_of_legaussians_are_those_of_a_loop(tiny_scene: Scene):
-    module = module_of(tiny_scene, "legaussians", "head.training.steps=20")
+    module = module_of(tiny_scene, "legaussians", "head.quantiser.steps=20")
     objective = module.step.setup.objectives["classes"]
     assert isinstance(objective, CodeClasses)
     codes, masks, _ = pixels(module)
@@ -168,7 +168,7 @@ def test_the_terms_of_legaussians_are_those_of_a_loop(tiny_scene: Scene):
 
 
 def test_legaussians_starts_as_it_says_and_reaches_shapes_and_opacity(tiny_scene: Scene):
-    module = module_of(tiny_scene, "legaussians", "head.training.steps=20")
+    module = module_of(tiny_scene, "legaussians", "head.quantiser.steps=20")
     splats = module.model.splats
     assert splats["features"].shape[1] == 8
     torch.testing.assert_close(splats["uncertainty"].sigmoid(), torch.full_like(splats["uncertainty"], 0.01))  # fmt: skip
@@ -185,7 +185,7 @@ def test_legaussians_starts_as_it_says_and_reaches_shapes_and_opacity(tiny_scene
 
 
 def test_codes_are_pulled_to_a_network_of_positions(tiny_scene: Scene):
-    module = module_of(tiny_scene, "legaussians", "head.training.steps=20")
+    module = module_of(tiny_scene, "legaussians", "head.quantiser.steps=20")
     objective = module.step.setup.objectives["smooth"]
     assert isinstance(objective, SmoothCodes)
     shapes = [tuple(p.shape) for p in objective.parameters() if p.dim() == 2]
@@ -217,10 +217,10 @@ def test_codes_are_pulled_to_a_network_of_positions(tiny_scene: Scene):
         (("langsplat_v2", "head=identity"), "codebook language: head must be codebook, which has entries, got Identity"),
         (("goi", "head=codebook"), "lookup language: head must be lookup, which has a table, got Codebook"),
         (("legaussians", "head=lookup"), "code classes: head must be quantised, which has classes, got LookupTable"),
-        (("legaussians", "loss.smooth.attribute=doubt", "head.training.steps=2"), "gaussians.attributes must have doubt, got means"),
+        (("legaussians", "loss.smooth.attribute=doubt", "head.quantiser.steps=2"), "gaussians.attributes must have doubt, got means"),
         (("goi", "loss.lookup.late=2"), "late must be 0 to 1, got 2"),
-        (("langsplat_v2", "loss.language.pixels=some"), "pixels must be one of valid, all, got 'some'"),
-        (("legaussians", "head.training.balance=-1"), "balance must be 0 to 1e\\+06, got -1"),
+        (("langsplat_v2", "loss.codebook.pixels=some"), "pixels must be one of valid, all, got 'some'"),
+        (("legaussians", "head.quantiser.balance=-1"), "balance must be 0 to 1e\\+06, got -1"),
         (("langsplat_v2", "gaussians.codes_kept=0"), "codes_kept must be 1 to 65536, got 0"),
     ],
 )  # fmt: skip

@@ -29,8 +29,8 @@ class Codebook(nn.Module):
     Example:
         >>> head = Codebook(dim=4, width=8)
         >>> head.fit(torch.eye(8), torch.ones(8))
-        >>> head.predict(torch.tensor([[1.0, 0.0, 0.0, 0.0]])).norm()
-        tensor(1., grad_fn=<LinalgVectorNormBackward0>)
+        >>> head.predict(torch.tensor([[1.0, 0.0, 0.0, 0.0]])).shape
+        torch.Size([1, 8])
     """
 
     def __init__(

@@ -51,7 +51,7 @@ class QuantisedCodes(nn.Module):
         width: Embedding width e; 512 for CLIP ViT-B/16.
         hidden: Widths of the network between code and scores.
         learning_rate: Adam's, for the network.
-        training: How the codebook is fitted.
+        quantiser: How the codebook is fitted.
 
     Raises:
         ValueError: If a width is not positive, or the learning rate is not in [0, 1].
@@ -72,7 +72,7 @@ class QuantisedCodes(nn.Module):
         width: int = 512,
         hidden: Sequence[int] = (128, 256),
         learning_rate: float = 1e-3,
-        training: QuantiserTraining = DEFAULT_TRAINING,
+        quantiser: QuantiserTraining = DEFAULT_TRAINING,
     ) -> None:
         super().__init__()
         require_range("quantised head", 1, 65536, dim=dim, entries=entries, width=width)
@@ -81,11 +81,11 @@ class QuantisedCodes(nn.Module):
         require_range("quantised head", 0, 1, learning_rate=learning_rate)
         self.dim = dim
         self.learning_rate: float | None = learning_rate
-        self.fit_settings = training
-        parts: list[nn.Module] = []
-        for before, after in pairwise((dim, *hidden, entries)):
-            parts += [nn.Linear(before, after), nn.ReLU()]
-        self.classifier = nn.Sequential(*parts[:-1])
+        self.fit_settings = quantiser
+        self.classifier = nn.Sequential()
+        for before, after in pairwise((dim, *hidden)):
+            self.classifier.extend([nn.Linear(before, after), nn.ReLU()])
+        self.classifier.append(nn.Linear(hidden[-1] if hidden else dim, entries))
         self.register_buffer("codebook", torch.zeros(entries, width))
 
     def fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:

@@ -1,8 +1,9 @@
 """GOI's optimisable hyperplane: what belongs to a word is learned from a mask in one view, and asked of all others (Qu et al., ACM MM 2024)."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,7 +14,7 @@ from vlgs.fields import Field
 from vlgs.fields.planes import Plane, with_planes
 from vlgs.fields.similarity import cosines
 from vlgs.query.prompts import Prompts
-from vlgs.types import Scene
+from vlgs.types import Scene, View
 from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
@@ -29,8 +30,9 @@ class Hyperplane:
     """Relevancy is ``sigmoid(f w / scale + b)`` of a unit feature f, with a plane (w, b) for each word.
 
     A plane starts as the word itself and is moved by gradient descent on the hinge loss of the pixels of one training view, until
-    its answer there overlaps the mask well enough. GOI takes this mask from a network that finds what words refer to; here it is the
-    mask of the training views whose vector is nearest to the word.
+    its answer there overlaps the mask well enough. GOI takes this mask from a network that finds what words refer to. Here it is one of
+    the training views' masks whose vectors are nearest to the word: the one whose pixels the field itself sets apart most, since single
+    masks may carry the vector of something else.
 
     Args:
         scale: Of the products; that of APE's embeddings in GOI.
@@ -39,6 +41,7 @@ class Hyperplane:
         learning_rate: Of the descent.
         steps: At most.
         overlap: IoU with the mask at which a plane is good enough.
+        candidates: How many of the nearest masks are looked at.
 
     Raises:
         ValueError: If a number is out of range.
@@ -49,6 +52,7 @@ class Hyperplane:
     learning_rate: float = 0.01
     steps: int = 8000
     overlap: float = 0.9
+    candidates: int = 5
 
     def __post_init__(self) -> None:
         require_range("hyperplane", 1e-6, 1e6, scale=self.scale)
@@ -56,6 +60,7 @@ class Hyperplane:
         require_range("hyperplane", 0, 1e3, learning_rate=self.learning_rate)
         require_range("hyperplane", 0, 10**7, steps=self.steps)
         require_range("hyperplane", 0, 1, overlap=self.overlap)
+        require_range("hyperplane", 1, 10**6, candidates=self.candidates)
 
     @property
     def negatives(self) -> Sequence[str]:
@@ -91,18 +96,17 @@ class Hyperplane:
             scene: Its training views and masks.
             prompts: The words.
         """
-        planes = []
+        planes, whole = [], field.levels()[-1]
         for name, word in zip(prompts.names, normalize(prompts.text.float(), dim=-1), strict=True):
-            found = _mask_of(scene, word)
+            found = self._mask_of(whole, scene, word)
             if found is None:
-                plane = Plane(word / self.scale, self.bias or 0.0)
-            else:
-                view, mask = found
-                seen = field.levels()[-1].similarity(
-                    scene.train[view].camera, torch.eye(len(word))
-                )  # [1, e, h, w]: the unit features
-                plane, overlap = self.fit(seen[0].flatten(1).T, mask.flatten(), word)
-                log.info("%s: plane with overlap %.2f in %s", name, overlap, scene.train[view].name)
+                planes.append(Plane(word / self.scale, self.bias or 0.0))
+                continue
+            view, mask = found
+            # Cosines with the axes are the unit features themselves.
+            seen = whole.similarity(view.camera, torch.eye(len(word)))  # [1, e, h, w]
+            plane, overlap = self.fit(seen[0].flatten(1).T, mask.flatten(), word)
+            log.info("%s: plane with overlap %.2f in %s", name, overlap, view.name)
             planes.append(plane)
         return with_planes(field, prompts.text, planes)
 
@@ -137,6 +141,18 @@ class Hyperplane:
             offset = offset - self.learning_rate * slope.sum()
         return Plane(best[0] / self.scale, best[1]), best_overlap
 
+    def _mask_of(
+        self, field: Field, scene: Scene, word: Float[Tensor, " e"]
+    ) -> tuple[View, Bool[Tensor, "h w"]] | None:
+        """The mask of a training view that is taken for a word; None without any."""
+
+        def contrast(found: tuple[View, Bool[Tensor, "h w"]]) -> float:
+            view, mask = found
+            answer = field.similarity(view.camera, word[None])[0, 0]
+            return float(answer[mask].mean() - answer[~mask].mean())
+
+        return max(islice(_masks_of(scene, word), self.candidates), key=contrast, default=None)
+
 
 def hinge_slope(
     distance: Float[Tensor, " r"], inside: Float[Tensor, " r"], outside: Float[Tensor, " r"]
@@ -146,18 +162,19 @@ def hinge_slope(
     return slope / (inside.sum() + outside.sum())
 
 
-def _mask_of(scene: Scene, word: Float[Tensor, " e"]) -> tuple[int, Bool[Tensor, "h w"]] | None:
-    """The training view and its mask whose vector is nearest to a word."""
+def _masks_of(
+    scene: Scene, word: Float[Tensor, " e"]
+) -> Iterator[tuple[View, Bool[Tensor, "h w"]]]:
+    """Training views and their masks, those whose vectors are nearest to a word first."""
     order = (normalize(scene.mask_vectors.float(), dim=-1) @ word).argsort(descending=True)
     for row in order.tolist():
-        for index, view in enumerate(scene.train):
+        for view in scene.train:
             if view.read_masks is None:
                 continue
             mask = view.read_masks() == row
             mask = mask if mask.dim() == 2 else mask.any(dim=-1)
-            if mask.any():
-                return index, mask
-    return None
+            if mask.any() and not mask.all():
+                yield view, mask
 
 
 def _different(
