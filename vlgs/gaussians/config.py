@@ -102,8 +102,9 @@ class GaussiansConfig:
     init_opacity: float = 0.1
     init_indicator: float = 0.1
     """The paper starts the indicator in the same manner as the opacity (its section 4.1)."""
-    init_features: Literal["zero", "lifted"] = "zero"
-    """Language codes at the start: zero, or the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`; conf/README.md, D.9)."""
+    init_features: Literal["zero", "lifted", "random"] = "zero"
+    """Language codes at the start: zero; the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`; conf/README.md, D.9);
+    or uniform as the degree-0 harmonic of a random colour, Gaussian Grouping's."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
@@ -147,7 +148,7 @@ class GaussiansConfig:
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),
-            "init_features": ("zero", "lifted"),
+            "init_features": ("zero", "lifted", "random"),
             "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
             "codes": ("none", "unit"),
@@ -160,7 +161,7 @@ class GaussiansConfig:
     @property
     def demands(self) -> Sequence[Demand]:
         """Codes are there to be lifted where the head is fitted before."""
-        if self.init_features == "zero":
+        if self.init_features != "lifted":
             return ()
         why = "as codes of masks are lifted onto the Gaussians"
         return (Demand("gaussians.init_features=lifted", "head", "untrained", why),)

@@ -7,7 +7,17 @@ YAML file.
 
 from vlgs.objectives.blended_view import BlendedView
 from vlgs.objectives.language import Language
+from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.photometric import Photometric
 
-__all__ = ["BlendedView", "Language", "Objective", "Photometric", "Setup", "StepView"]
+__all__ = [
+    "BlendedView",
+    "Language",
+    "MaskClasses",
+    "NeighbourClasses",
+    "Objective",
+    "Photometric",
+    "Setup",
+    "StepView",
+]
