@@ -128,10 +128,21 @@ def test_the_gradient_of_classes_reaches_everything_and_that_of_neighbours_codes
         )
         moved = {n for n, g in zip(names, gradients, strict=True) if g is not None and g.any()}
         assert moved == reached
-        (own,) = torch.autograd.grad(
-            done.terms[term], [module.model.head.map.weight], retain_graph=True
+        own, *_ = torch.autograd.grad(
+            done.terms[term], list(module.model.head.parameters()), retain_graph=True
         )
         assert own.any()
+
+
+def test_neighbours_of_many_have_the_same_gradient_every_time(tiny_scene: Scene):
+    module = module_of(tiny_scene, "head.dim=64")  # 5 x 400 x 64 numbers are shared out to threads
+    features, step = module.model.splats["features"], module.step.forward(0)
+    (near,) = (o for o in module.step.setup.objectives.values() if isinstance(o, NeighbourClasses))
+    first, *others = (
+        torch.autograd.grad(near(step.seen)["neighbours"], features, retain_graph=True)[0]
+        for _ in range(5)
+    )
+    assert all(torch.equal(first, other) for other in others)
 
 
 def test_its_method_is_what_it_says():

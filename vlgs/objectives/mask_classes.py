@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import cross_entropy, embedding
 
 from vlgs.demands import Demand
 from vlgs.gaussians.init import seeded_generator
@@ -112,11 +112,15 @@ class NeighbourClasses(Objective):
         """One term in every `every`-th iteration."""
         if not self.has_language or step.step % self.every:
             return {}
-        codes = step.fused.feature.unflatten(1, (-1, self.head.dim))  # [n, levels, d]
         drawn, near = self.draw(step.fused.gaussians.means.detach(), step.step)
         if near.numel() == 0:
             return {}
-        return {"neighbours": self.of(codes[drawn], codes[near])}
+        # By index several threads would sum the gradient of a neighbour of many in any order.
+        own, others = (
+            embedding(rows, step.fused.feature).unflatten(-1, (-1, self.head.dim))
+            for rows in (drawn, near)
+        )
+        return {"neighbours": self.of(own, others)}
 
     def draw(
         self, means: Float[Tensor, "n 3"], step: int
