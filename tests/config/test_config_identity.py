@@ -29,7 +29,7 @@ that it moves nothing."""
 NAMES = {
     "augment": "none offline",
     "blend": "beta fixed gaussian none uniform",
-    "head": "autoencoder identity linear",
+    "head": "autoencoder classifier identity linear",
     "data": "colmap synthetic",
     "encoder": "clip maps",
     "fusion": "cross mlp none self",
@@ -40,7 +40,8 @@ NAMES = {
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
-    "stages": "lift train train_color",
+    "lift": "direction mean robust squared top_k",
+    "stages": "associate lift train train_color",
     "text": "clip vocabulary",
     "trainer": "base",
 }
@@ -68,6 +69,7 @@ def every_option() -> list[DictConfig]:
     """Configurations that between them have every option of a run."""
     chosen = {group: options(group) for group in groups() if "/" not in group}
     del chosen["features"]
+    rules = chosen.pop("lift")  # what method=lift alone has
     chosen |= {"data": ["synthetic", "colmap"], "logger": ["csv"]}
     found = []
     for index in range(max(map(len, chosen.values()))):
@@ -76,6 +78,7 @@ def every_option() -> list[DictConfig]:
             parts = ("sam", "clip") if index < 3 else ("superpixels", "maps")
             picked += [f"features/{kind}={part}" for kind, part in zip(("segmenter", "encoder"), parts, strict=True)]  # fmt: skip
             picked += ["features.extractor.encoder.folder=maps"] * ("maps" in parts)
+        picked += [f"lift={rules[index % len(rules)]}"] if "method=lift" in picked else []
         picked += ["data.root=here"] if "data=colmap" in picked else []
         plain: Any = OmegaConf.to_container(composed(*picked), resolve=True)
         if index == 0:
