@@ -78,7 +78,6 @@ def every_option() -> list[DictConfig]:
             parts = ("sam", "clip") if index < 3 else ("superpixels", "maps")
             picked += [f"features/{kind}={part}" for kind, part in zip(("segmenter", "encoder"), parts, strict=True)]  # fmt: skip
             picked += ["features.extractor.encoder.folder=maps"] * ("maps" in parts)
-        picked += [f"lift={rules[index % len(rules)]}"] if "method=lift" in picked else []
         picked += ["data.root=here"] if "data=colmap" in picked else []
         plain: Any = OmegaConf.to_container(composed(*picked), resolve=True)
         if index == 0:
@@ -87,7 +86,7 @@ def every_option() -> list[DictConfig]:
             ]
             plain["stages"] = [contents(path) for path in stages]
         found.append(OmegaConf.create(plain))
-    return found
+    return found + [composed("method=lift", f"lift={rule}") for rule in rules]
 
 
 def ids(config: DictConfig) -> tuple[object, ...]:
