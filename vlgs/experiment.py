@@ -127,6 +127,7 @@ def construct(config: DictConfig) -> Experiment:
     chosen = {field.name: getattr(parts, field.name) for field in fields(Parts)}
     for key in ("augment", "levels", "method"):
         chosen[key] = getattr(experiment, key)
+    chosen |= {f"loss.{name}": objective for name, objective in parts.loss.items()}
     for demand in unmet(chosen):
         raise ValueError(_refusal(config, demand))
     return experiment

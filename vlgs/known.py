@@ -237,7 +237,8 @@ def _top(name: str) -> frozenset[str]:
     chosen = {str(g) for entry in content["defaults"] if isinstance(entry, dict) for g in entry}
     chosen = {group for group in chosen if not group.startswith("override ")}
     kept = set(content) - {"defaults", "hydra"}
-    return frozenset(kept | chosen | {"features"})  # what augment=offline_sam brings
+    brought = {"features", "lift"}  # by augment=offline_sam and method=lift
+    return frozenset(kept | chosen | brought)
 
 
 @cache

@@ -29,7 +29,7 @@ that it moves nothing."""
 NAMES = {
     "augment": "none offline",
     "blend": "beta fixed gaussian none uniform",
-    "head": "autoencoder codebook identity linear lookup quantised",
+    "head": "autoencoder classifier codebook identity linear lookup quantised",
     "data": "colmap synthetic",
     "encoder": "clip maps",
     "fusion": "cross mlp none self",
@@ -40,7 +40,8 @@ NAMES = {
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
-    "stages": "lift train train_color",
+    "lift": "direction mean robust squared top_k",
+    "stages": "associate lift train train_color",
     "text": "clip vocabulary",
     "trainer": "base",
 }
@@ -68,6 +69,7 @@ def every_option() -> list[DictConfig]:
     """Configurations that between them have every option of a run."""
     chosen = {group: options(group) for group in groups() if "/" not in group}
     del chosen["features"]
+    rules = chosen.pop("lift")  # what method=lift alone has
     chosen |= {"data": ["synthetic", "colmap"], "logger": ["csv"]}
     found = []
     for index in range(max(map(len, chosen.values()))):
@@ -84,7 +86,7 @@ def every_option() -> list[DictConfig]:
             ]
             plain["stages"] = [contents(path) for path in stages]
         found.append(OmegaConf.create(plain))
-    return found
+    return found + [composed("method=lift", f"lift={rule}") for rule in rules]
 
 
 def ids(config: DictConfig) -> tuple[object, ...]:

@@ -107,9 +107,9 @@ class GaussiansConfig:
     init_opacity: float = 0.1
     init_indicator: float = 0.1
     """The paper starts the indicator in the same manner as the opacity (its section 4.1)."""
-    init_features: Literal["zero", "lifted", "normal"] = "zero"
-    """Language codes at the start: zero, the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`;
-    conf/README.md, D.9), or drawn from N(0, 1), as LEGaussians'."""
+    init_features: Literal["zero", "lifted", "normal", "random"] = "zero"
+    """Language codes at the start: zero; the mean of the training views' codes as the first Gaussians blend them (`vlgs.training.lift`; conf/README.md, D.9);
+    drawn from N(0, 1), as LEGaussians'; or uniform as the degree-0 harmonic of a random colour, Gaussian Grouping's."""
     init_points: int = 20_000
     """Random points for a scene without sparse points."""
     background: int = 1500
@@ -157,7 +157,7 @@ class GaussiansConfig:
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),
-            "init_features": ("zero", "lifted", "normal"),
+            "init_features": ("zero", "lifted", "normal", "random"),
             "prune_on": ("max", "opacity", "indicator"),
             "densify_on": ("total", "rgb"),
             "codes": ("none", "unit", "sparse"),

@@ -10,6 +10,7 @@ from vlgs.objectives.code_classes import CodeClasses
 from vlgs.objectives.codebook import CodebookLanguage
 from vlgs.objectives.language import Language
 from vlgs.objectives.lookup import LookupLanguage
+from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.photometric import Photometric
 from vlgs.objectives.smooth_codes import SmoothCodes
@@ -20,6 +21,8 @@ __all__ = [
     "CodebookLanguage",
     "Language",
     "LookupLanguage",
+    "MaskClasses",
+    "NeighbourClasses",
     "Objective",
     "Photometric",
     "Setup",

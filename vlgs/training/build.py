@@ -15,6 +15,8 @@ from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
 from vlgs.gaussians.background import with_background
+from vlgs.gaussians.init import seeded_generator
+from vlgs.gaussians.sh import SH_C0
 from vlgs.heads import FittedHead, Head
 from vlgs.indicator import Indicator
 from vlgs.objectives import Objective, Setup
@@ -133,7 +135,16 @@ def build_module(
     module = VLGSModule(model, setup, config, parts.trainer, seed)
     if config.init_features == "lifted":
         lift_features(module)
+    elif config.init_features == "random" and language:
+        _randomise(model.splats["features"], seed)
     return module
+
+
+@torch.no_grad()
+def _randomise(features: Tensor, seed: int) -> None:
+    """Draw codes as degree-0 harmonics of random colours, in place."""
+    generator = seeded_generator("features", seed, 0)
+    features.copy_((torch.rand(features.shape, generator=generator) - 0.5) / SH_C0)
 
 
 def bind(

@@ -19,6 +19,7 @@ from vlgs.fields.several import SeveralFields
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.training.build import Parts, scaled
+from vlgs.training.lift_rules import LiftRule
 from vlgs.training.separate import without_language
 from vlgs.training.workshop import Workshop
 from vlgs.types import Scene
@@ -95,6 +96,19 @@ class Stage(Protocol):
 
 
 @runtime_checkable
+class Particular(Protocol):
+    """A stage that not every scene will do for."""
+
+    def require(self, scenes: Mapping[Level, Scene]) -> None:
+        """Refuse what it cannot learn from, before anything is trained.
+
+        Raises:
+            ValueError: If a scene lacks something.
+        """
+        ...
+
+
+@runtime_checkable
 class Stages(Protocol):
     """An option that contributes to the list of stages."""
 
@@ -154,10 +168,15 @@ def run_stages(
 
     Raises:
         StoppedError: If training was asked to stop.
+        ValueError: If a stage needs what the scenes do not have (`Particular`).
     """
     language = any(len(scene.mask_vectors) for scene in scenes.values())
     progress = Progress(scenes if language else dict(list(scenes.items())[-1:]))
-    for stage in list_stages(options, language):
+    stages = list(list_stages(options, language))
+    for stage in stages:
+        if isinstance(stage, Particular):
+            stage.require(scenes)
+    for stage in stages:
         progress = stage.run(progress, workshop)
     return progress
 
@@ -239,7 +258,7 @@ class TrainColor:
 
 @dataclass(frozen=True)
 class Lift:
-    """Gives every Gaussian of an earlier stage the mean code of the masked pixels that it is blended into; nothing is trained."""
+    """Gives every Gaussian of an earlier stage a code of the masked pixels that it is blended into; nothing is trained."""
 
     demands: ClassVar[Sequence[Demand]] = tuple(
         Demand("language that is lifted", group, "untrained", "as nothing trains it")
@@ -249,6 +268,8 @@ class Lift:
     """The earlier stage."""
     name: str = ""
     """Of the sub-folder; empty for the folder of the run, or of the mask level."""
+    lift: LiftRule | None = None
+    """From masks to a code; None: the mean of codes (`vlgs.training.lift`)."""
 
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
         """See `Stage`. A mask level without a single mask has nothing to be lifted, and is trained on colour."""
@@ -256,7 +277,8 @@ class Lift:
         for level, scene in progress.scenes.items():
             folder = progress.folder(level, self.name)
             if len(scene.mask_vectors):
-                models[level] = workshop.lift(folder, scene, progress.gaussians(self.start, level))
+                start = progress.gaussians(self.start, level)
+                models[level] = workshop.lift(folder, scene, start, self.lift)
             else:
                 models[level] = workshop.train(folder, scene)
         return progress.having(self.name, models)

@@ -17,6 +17,7 @@ from vlgs.training.build import Parts, build_module
 from vlgs.training.checkpoint import checkpoint_bytes, save_checkpoint
 from vlgs.training.fit import FitOptions, fit
 from vlgs.training.lift import lift_features
+from vlgs.training.lift_rules import LiftRule, lift_by
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.state import capture
 from vlgs.types import Scene
@@ -108,18 +109,21 @@ class Workshop:
             raise StoppedError(stopped_by, where)
         return self._remember(name, module, color or start is not None, kept)
 
-    def lift(self, name: str, scene: Scene, start: SplatModel) -> SplatField:
-        """Lift the language of a scene onto finished Gaussians (`lift_features`); the folder is as that of a trained model.
+    def lift(
+        self, name: str, scene: Scene, start: SplatModel, rule: LiftRule | None = None
+    ) -> SplatField:
+        """Lift the language of a scene onto finished Gaussians; the folder is as that of a trained model.
 
         Args:
             name: Sub-folder; empty for the folder of the run itself.
             scene: Whose masks count.
             start: Trained on colour.
+            rule: From masks to codes; None: the mean of codes (`lift_features`).
         """
         folder, started = self.folder.part(name), time.perf_counter()
         module = self._build(scene, self.make_parts(), start)
         module.model.sh_degree = start.sh_degree
-        lift_features(module)
+        lift_features(module) if rule is None else lift_by(rule, module)
         module.next_step = module.settings.iterations
         module.train_seconds = time.perf_counter() - started
         folder.require_own()

@@ -1,0 +1,141 @@
+"""How much of every Gaussian the masks of the training views show: blending weights, summed over the pixels of each mask.
+
+A view has a few dozen masks and thousands of pixels, so that language is lifted and masks are associated through these sums: no map of
+embeddings is ever made.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from vlgs.fields.splat import SplatModel
+from vlgs.ops.pixel_weights import PixelWeights, pixel_weights
+from vlgs.ops.project import project
+from vlgs.types import Scene, View
+
+CHANNELS = 64
+"""Masks whose sums are formed in one pass over the tiles."""
+
+Share = Callable[[PixelWeights], Float[Tensor, " z"]]
+"""From the weights of some pixels to what is summed of each."""
+
+
+@dataclass(frozen=True)
+class MaskWeights:
+    """Sums of every pair of a Gaussian and a mask that have one, by Gaussian and then by mask."""
+
+    gaussian: Int[Tensor, " z"]
+    mask: Int[Tensor, " z"]
+    """Row of `Scene.mask_vectors`."""
+    weight: Float[Tensor, " z"]
+    """Above 0."""
+    gaussians: int
+    """How many there are."""
+
+    def sums(
+        self, vectors: Float[Tensor, "m t"], weight: Float[Tensor, " z"] | None = None
+    ) -> Float[Tensor, "n t"]:
+        """Per Gaussian the weighted sum of the vectors of its masks; 0 where it has none.
+
+        Args:
+            vectors: One per mask.
+            weight: In place of `weight`.
+        """
+        used = self.weight if weight is None else weight
+        starts = torch.searchsorted(self.gaussian, torch.arange(self.gaussians))
+        return embedding_bag(
+            self.mask, vectors, starts, mode="sum", per_sample_weights=used.to(vectors)
+        )
+
+    def totals(self) -> Float[Tensor, "n 1"]:
+        """Per Gaussian the sum over its masks."""
+        total = self.weight.new_zeros(self.gaussians)
+        return total.index_add_(0, self.gaussian, self.weight)[:, None]
+
+
+@torch.no_grad()
+def mask_weights(
+    model: SplatModel, scene: Scene, level: int = 0, share: Share | None = None
+) -> MaskWeights:
+    """The sums over all training views, with the weights that blend language.
+
+    Args:
+        model: Whose Gaussians.
+        scene: Whose masks.
+        level: Place of the mask level, where `Scene.mask_levels` are several.
+        share: What is summed of each pixel's weights; None: the weight itself, by the rasterizer's own backward pass.
+    """
+    weight = model.fuse().language_weight
+    weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
+    found: list[Tensor] = []
+    values: list[Tensor] = []
+    for view, index in masked_views(scene, level):
+        numbers, local = torch.unique(index, return_inverse=True)
+        if share is None:
+            sums = _by_backward(model, view, weight, local, len(numbers))
+        else:
+            sums = _one_by_one(model, view, weight, local, len(numbers), share)
+        sums[:, numbers < 0] = 0
+        pairs = sums.nonzero()
+        found.append(torch.stack([pairs[:, 0], numbers[pairs[:, 1]].long()]))
+        values.append(sums[pairs[:, 0], pairs[:, 1]])
+    pairs = torch.cat(found, dim=1) if found else torch.zeros(2, 0, dtype=torch.long)
+    summed = torch.cat(values) if values else weight.new_zeros(0)
+    order = (pairs[0] * max(1, len(scene.mask_vectors)) + pairs[1]).argsort(stable=True)
+    return MaskWeights(pairs[0][order], pairs[1][order], summed[order], model.count)
+
+
+def masked_views(scene: Scene, level: int = 0) -> Iterator[tuple[View, Int[Tensor, "h w"]]]:
+    """The training views that have masks, with those of one level."""
+    for view in scene.train:
+        if view.read_masks is not None:
+            index = view.read_masks()
+            yield view, index if index.dim() == 2 else index[..., level]
+
+
+def _by_backward(
+    model: SplatModel,
+    view: View,
+    weight: Float[Tensor, " n"],
+    local: Int[Tensor, "h w"],
+    count: int,
+) -> Float[Tensor, "n masks"]:
+    """The sums are the gradient of the image by what is blended, upstream of it one channel per mask."""
+    parts: list[Tensor] = []
+    for first in range(0, count, CHANNELS):
+        numbers = torch.arange(first, min(first + CHANNELS, count))
+        inside = (local[..., None] == numbers).to(weight)
+        values = weight.new_zeros(len(weight), len(numbers), requires_grad=True)
+        with torch.enable_grad():
+            image = model.render_values(view.camera, values, weight)
+            parts.append(torch.autograd.grad(image, values, inside)[0])
+    return torch.cat(parts, dim=1)
+
+
+def _one_by_one(
+    model: SplatModel,
+    view: View,
+    weight: Float[Tensor, " n"],
+    local: Int[Tensor, "h w"],
+    count: int,
+    share: Share,
+) -> Float[Tensor, "n masks"]:
+    gaussians, flat = model.gaussians(), local.flatten()
+    quats, scales = gaussians.quats, gaussians.scales
+    if (own := gaussians.language_shape) is not None:
+        quats, scales = own.quats, own.scales
+    splats = project(gaussians.means, quats, scales, view.camera, model.raster)
+    sums = torch.zeros(len(weight) * count, dtype=torch.float64)
+    for part in pixel_weights(splats, weight, view.camera, model.raster):
+        sums.index_add_(0, part.gaussian * count + flat[part.pixel], share(part))
+    return sums.view(-1, count).to(weight)
+
+
+def by_rank(part: PixelWeights) -> tuple[Int[Tensor, " z"], Int[Tensor, " z"]]:
+    """Entries in the order of pixels and, in each, of falling weights; and their ranks, from 0. Of equal weights the front one comes first."""
+    order = (part.pixel - part.weight).argsort(stable=True)  # weights are below 1
+    return order, torch.arange(len(order)) - torch.searchsorted(part.pixel, part.pixel)
