@@ -128,9 +128,9 @@ def test_the_gradient_of_classes_reaches_everything_and_that_of_neighbours_codes
         )
         moved = {n for n, g in zip(names, gradients, strict=True) if g is not None and g.any()}
         assert moved == reached
-        own, *_ = torch.autograd.grad(
-            done.terms[term], list(module.model.head.parameters()), retain_graph=True
-        )
+        head = module.model.head
+        assert isinstance(head, torch.nn.Module)
+        own, *_ = torch.autograd.grad(done.terms[term], list(head.parameters()), retain_graph=True)
         assert own.any()
 
 
