@@ -1,10 +1,11 @@
 """Base of the callbacks that act after an iteration, of which Lightning tells them more than they need."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, cast
 
 import lightning as L
 
+from vlgs.training.learner import Learner
 from vlgs.training.lightning import VLGSModule
 
 
@@ -28,6 +29,9 @@ class AfterStep(L.Callback):
 
 
 def own(module: L.LightningModule) -> VLGSModule:
-    """The module that Lightning hands to a callback, as what it is here."""
-    assert isinstance(module, VLGSModule)
-    return module
+    """The module that Lightning hands to a callback, as what it is here.
+
+    A `Learner` is taken for one too: it has all that its callbacks look at (`vlgs.training.fit_learner`).
+    """
+    assert isinstance(module, VLGSModule | Learner)
+    return cast(VLGSModule, module)

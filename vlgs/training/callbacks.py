@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -18,6 +19,7 @@ from vlgs.runs import RunFolder, stop_signals
 from vlgs.training.after_step import AfterStep, own
 from vlgs.training.checkpoint import save_checkpoint
 from vlgs.training.curves import COLUMNS, csv_lines, read_rows
+from vlgs.training.learner import Learner
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.silence import silence
 from vlgs.training.state import capture
@@ -100,7 +102,8 @@ class Checkpoints(AfterStep):
 
     def _save(self, module: VLGSModule) -> None:
         if module.next_step != self.saved:
-            save_checkpoint(self.folder, capture(module, self.meta))
+            state = module.capture if isinstance(module, Learner) else partial(capture, module)
+            save_checkpoint(self.folder, state(self.meta))
             self.saved = module.next_step
 
 
@@ -140,7 +143,7 @@ class CurveLog(AfterStep):
         row = {
             "loss": report.loss,
             "psnr": psnr_of(report.color_mse),
-            "n_gaussians": module.model.count,
+            "n_gaussians": module.count,
             "blend_weight": report.log.get("blend_weight", 0.0),
             "seconds": module.train_seconds,
         }
@@ -168,7 +171,7 @@ class ProgressLine(AfterStep):
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
             TextColumn(
-                "loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]:,} Gaussians"
+                "loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]}"
             ),
             TimeRemainingColumn(compact=True),
             TextColumn("left"),
@@ -186,7 +189,7 @@ class ProgressLine(AfterStep):
             completed=module.next_step,
             loss=0.0,
             psnr=0.0,
-            count=module.model.count,
+            count=_gaussians(module.count),
         )
         with suppress(OSError):
             self.bar.start()
@@ -206,7 +209,7 @@ class ProgressLine(AfterStep):
             completed=module.next_step,
             loss=report.loss,
             psnr=psnr_of(self.mse),
-            count=module.model.count,
+            count=_gaussians(module.count),
         )
         with suppress(OSError):  # a closed terminal must not end a training
             self.bar.refresh()
@@ -273,6 +276,10 @@ def _leave_closed_terminal(terminals: list[int]) -> None:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, descriptor)
             os.close(nowhere)
+
+
+def _gaussians(count: int) -> str:
+    return f"{count:,} Gaussians" if count else ""
 
 
 def psnr_of(mse: float) -> float:
