@@ -85,7 +85,9 @@ class HashGrid(nn.Module):
         self._resolutions = torch.tensor(config.resolutions)
         self._offsets = (rows.cumsum(0) - rows).int()[:, None]
         # Grids only grow, so that those with a row for each corner come first.
-        self._dense = sum((cells + 1) ** 3 <= 1 << config.log2_table for cells in config.resolutions)
+        self._dense = sum(
+            (cells + 1) ** 3 <= 1 << config.log2_table for cells in config.resolutions
+        )
         # 32-bit products wrap around, as the hash wants them.
         sizes = (self._resolutions + 1).int()
         self._steps = {prime: torch.full_like(sizes, _wrapped(prime))[:, None] for prime in _PRIMES}
@@ -96,14 +98,18 @@ class HashGrid(nn.Module):
         """Features of points in the unit cube; those beside it count as on its side. No gradient reaches the points."""
         with torch.no_grad():
             rows, weights = self.corners(points)
-        features = interpolate(self.table, rows, weights).view(-1, len(points), self.config.features)
+        features = interpolate(self.table, rows, weights).view(
+            -1, len(points), self.config.features
+        )
         return features.transpose(0, 1).flatten(1)
 
     def corners(
         self, points: Float[Tensor, "n 3"]
     ) -> tuple[Int32[Tensor, "nl 8"], Float[Tensor, "nl 8"]]:
         """Rows of the table, and their shares, that make up each feature: point by point for each grid."""
-        places = points.clamp(0, 1).T.contiguous()  # [3, n]: long rows, which vector instructions like
+        places = points.clamp(
+            0, 1
+        ).T.contiguous()  # [3, n]: long rows, which vector instructions like
         resolutions = self._resolutions.to(points)[:, None]
         shares, ends = [], []
         for place, prime in zip(places, _PRIMES, strict=True):

@@ -9,7 +9,6 @@ from torch import Tensor
 from vlgs.fields import Field, FieldImages, require_outputs
 from vlgs.fields.language_field import LanguageField
 from vlgs.fields.radiance import RadianceField, Samples
-from vlgs.fields.rays import Rays, pixel_rays
 from vlgs.fields.similarity import CHUNK, cosines
 from vlgs.types import Camera
 
@@ -58,7 +57,7 @@ class NerfField:
         require_outputs("radiance field", outputs, self.outputs)
         colors, features = [], []
         for pixels in torch.arange(camera.height * camera.width).split(RAYS):
-            rays = self.radiance.frame.inside(pixel_rays(camera, pixels))
+            rays = self.radiance.frame.look(camera, pixels)
             samples = self.radiance.sample(rays)
             color, weights, _ = self.radiance(rays, samples)
             colors.append(color)

@@ -1,7 +1,8 @@
 """A radiance field: density and colour of every point of space, from a hash grid and two small networks."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
@@ -9,13 +10,18 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
 from vlgs.fields.hash_grid import GridConfig, HashGrid, contract
-from vlgs.fields.rays import Rays, Spacing, importance, ray_weights
+from vlgs.fields.rays import Rays, Spacing, importance, nearest_seen, pixel_rays, ray_weights
+from vlgs.types import Camera
 from vlgs.values import require_fields, require_range
 
 _GEOMETRY = 15
 """Numbers that the density's network hands to that of colour."""
 _DIRECTION = 16
 """Harmonics of the direction of view, degrees 0 to 3."""
+_THICKEST = 5.0
+"""A cell of the kept densities counts as no denser: a ray may pass what fills only a part of it, and must find what lies behind."""
+_MARGIN = 0.85
+"""Of the distance of the nearest sparse point."""
 _FOG = 4.0
 """Space begins with a density of exp(-4) to the unit: an even fog of more hides from all cameras what they should agree on."""
 _HIGHEST = 12.0
@@ -58,10 +64,19 @@ class Frame:
     """World units times this are those of the ball."""
     spacing: Spacing
     """In units of the ball."""
+    points: Float[Tensor, "p 3"]
+    """On surfaces, in world units: nothing is looked for much nearer to a camera than those that it sees; may be empty."""
 
     def inside(self, rays: Rays) -> Rays:
         """Rays of the world in units of the ball."""
-        return Rays((rays.origins - self.center) * self.scale, rays.directions)
+        near = None if rays.near is None else rays.near * self.scale
+        return Rays((rays.origins - self.center) * self.scale, rays.directions, near)
+
+    def look(self, camera: Camera, pixels: Int[Tensor, " r"]) -> Rays:
+        """Rays through pixels of a camera, counted row by row, in units of the ball."""
+        rays = pixel_rays(camera, pixels)
+        near = nearest_of(nearest_seen(camera, self.points), camera.width, camera.height, pixels)
+        return self.inside(replace(rays, near=near))
 
 
 @dataclass(frozen=True)
@@ -112,26 +127,29 @@ class RadianceField(nn.Module):
             generator: Moves them at random, for training; None: they are where they always are.
         """
         config, spacing = self.config, self.frame.spacing
-        r, device = len(rays.origins), rays.origins
+        r = len(rays.origins)
         edges = torch.linspace(0, 1, config.coarse + 1).expand(r, -1)
         if generator is not None:
             shift = torch.rand(r, 1, generator=generator) - 0.5
-            edges = torch.cat([edges[:, :1], edges[:, 1:-1] + shift / config.coarse, edges[:, -1:]], -1)
-        far = spacing(edges)
+            edges = torch.cat(
+                [edges[:, :1], edges[:, 1:-1] + shift / config.coarse, edges[:, -1:]], -1
+            )
+        near = None if rays.near is None else rays.near[:, None]
+        far = spacing(edges, near)
         middles = (far[:, 1:] + far[:, :-1]) / 2
-        density = self.kept[self._cells(_in_cube(rays.points(middles)).flatten(0, 1))].view(r, -1)
-        weights = ray_weights(density, far.diff(dim=-1))
+        density = self.kept[self._cells(in_cube(rays.points(middles)).flatten(0, 1))].view(r, -1)
+        weights = ray_weights(density.clamp_max(_THICKEST), far.diff(dim=-1))
         weights = weights + 0.05 * weights.sum(-1, keepdim=True) / config.coarse + 1e-5
         draws = torch.linspace(0, 1, config.samples + 1).expand(r, -1)
         if generator is not None:
             shift = torch.rand(r, config.samples + 1, generator=generator) - 0.5
             draws = (draws + shift / config.samples).clamp(0, 1)
         edges = importance(edges, weights, draws)
-        far = spacing(edges)
+        far = spacing(edges, near)
         middles = (far[:, 1:] + far[:, :-1]) / 2
         lengths = far.diff(dim=-1)
         lengths = torch.cat([lengths[:, :-1], torch.full_like(lengths[:, :1], 1e10)], dim=-1)
-        return Samples(edges, middles, lengths, _in_cube(rays.points(middles)))
+        return Samples(edges, middles, lengths, in_cube(rays.points(middles)))
 
     def density(
         self, places: Float[Tensor, "n 3"]
@@ -160,7 +178,9 @@ class RadianceField(nn.Module):
     def keep(self, samples: Samples, density: Float[Tensor, "r s"]) -> None:
         """Remember densities for `sample`: those seen now, or what was there before, which fades."""
         cells = self._cells(samples.places.flatten(0, 1))
-        seen = torch.zeros_like(self.kept).scatter_reduce_(0, cells.long(), density.flatten(), "amax")
+        seen = torch.zeros_like(self.kept).scatter_reduce_(
+            0, cells.long(), density.flatten(), "amax"
+        )
         fading = torch.maximum(0.9 * self.kept, seen)
         self.kept = torch.where(seen > 0, fading, self.kept)
 
@@ -169,7 +189,7 @@ class RadianceField(nn.Module):
         """Look closely around points of the ball at first: something is there."""
         n = self.config.cells
         there = torch.zeros_like(self.kept)
-        there[self._cells(_in_cube(points))] = _EXPECTED
+        there[self._cells(in_cube(points))] = _EXPECTED
         around = max_pool3d(there.view(1, n, n, n), kernel_size=3, stride=1, padding=1).flatten()
         self.kept = torch.maximum(self.kept, around)
 
@@ -179,13 +199,29 @@ class RadianceField(nn.Module):
         return (z * n + y) * n + x
 
 
+def nearest_of(
+    seen: Float[Tensor, "*r c c"],
+    width: int | Tensor,
+    height: int | Tensor,
+    pixels: Int[Tensor, " r"],
+) -> Float[Tensor, " r"]:
+    """What `nearest_seen` says of pixels, with a margin."""
+    cells = seen.shape[-1]
+    x, y = (pixels % width) * cells // width, (pixels // width) * cells // height
+    at = y * cells + x
+    flat = seen.flatten(-2)
+    return _MARGIN * (flat[at] if flat.dim() == 1 else flat.gather(1, at[:, None])[:, 0])
+
+
 def mlp(widths: list[int], generator: torch.Generator | None = None) -> nn.Sequential:
     """Linear layers with ReLU between them, with He's initial weights and no bias at first."""
     layers: list[nn.Module] = []
-    for inner, outer in zip(widths[:-1], widths[1:], strict=True):
+    for inner, outer in pairwise(widths):
         layer = nn.Linear(inner, outer)
         with torch.no_grad():
-            layer.weight.copy_(torch.randn(outer, inner, generator=generator) * math.sqrt(2 / inner))
+            layer.weight.copy_(
+                torch.randn(outer, inner, generator=generator) * math.sqrt(2 / inner)
+            )
             layer.bias.zero_()
         layers += [layer, nn.ReLU()]
     return nn.Sequential(*layers[:-1])
@@ -206,6 +242,6 @@ def harmonics(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 16"]:
     )  # fmt: skip
 
 
-def _in_cube(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+def in_cube(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Points of the ball and around it, contracted, in the unit cube."""
     return (contract(points) + 2) / 4

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import max_pool2d, normalize
 
 from vlgs.geometry import camera_center
 from vlgs.types import Camera
@@ -18,6 +18,8 @@ class Rays:
     origins: Float[Tensor, "r 3"]
     directions: Float[Tensor, "r 3"]
     """Unit length."""
+    near: Float[Tensor, " r"] | None = None
+    """Distances before which nothing is looked for; None: those of `Spacing`."""
 
     def points(self, distances: Float[Tensor, "r s"]) -> Float[Tensor, "r s 3"]:
         """Where they are at distances from their origins."""
@@ -52,19 +54,50 @@ class Spacing:
 
     def __post_init__(self) -> None:
         if not 0 < self.near < self.far:
-            raise ValueError(f"spacing: near must be above 0 and below far ({self.far}), got {self.near}")
+            raise ValueError(
+                f"spacing: near must be above 0 and below far ({self.far}), got {self.near}"
+            )
 
-    def __call__(self, steps: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-        """Distances of steps in [0, 1].
+    def __call__(
+        self, steps: Float[Tensor, "*n"], near: Float[Tensor, "..."] | None = None
+    ) -> Float[Tensor, "*n"]:
+        """Distances of steps in [0, 1], perhaps with a nearest distance of each ray's own.
 
         Example:
             >>> Spacing(1.0, 4.0, 0.5)(torch.tensor([0.0, 0.25, 0.5, 0.75]))
             tensor([1.0000, 2.5000, 4.0000, 7.9920])
         """
-        even = self.near + (self.far - self.near) * steps / self.share
+        first = (
+            torch.as_tensor(self.near) if near is None else near.clamp(self.near, 0.9 * self.far)
+        )
+        even = first + (self.far - first) * steps / self.share
         beyond = ((steps - self.share) / (1 - self.share)).clamp(0, 1)
         inverse = (1 - beyond) / self.far + beyond / (self.far * self.horizon)
         return torch.where(steps < self.share, even, 1 / inverse)
+
+
+def nearest_seen(
+    camera: Camera, points: Float[Tensor, "p 3"], cells: int = 16
+) -> Float[Tensor, "cells cells"]:
+    """Distance of the nearest point that a camera sees in or beside each cell of a coarse raster; 0 where there is none.
+
+    Args:
+        camera: Where to look from.
+        points: Of the world, on surfaces.
+        cells: Of the raster along each axis.
+    """
+    seen = points.to(camera.viewmat) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    image = seen @ camera.K.to(seen).T
+    size = seen.new_tensor([camera.width, camera.height])
+    place = (image[:, :2] / image[:, 2:].clamp_min(1e-9) / size * cells).floor()
+    inside = (image[:, 2] > 0) & (place >= 0).all(1) & (place < cells).all(1)
+    x, y = place[inside].long().unbind(1)
+    closeness = seen.new_zeros(cells * cells)
+    closeness.scatter_reduce_(
+        0, y * cells + x, 1 / seen[inside].norm(dim=1).clamp_min(1e-9), "amax"
+    )
+    around = max_pool2d(closeness.view(1, cells, cells), kernel_size=3, stride=1, padding=1)[0]
+    return torch.where(around > 0, 1 / around, 0.0)
 
 
 def importance(

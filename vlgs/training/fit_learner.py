@@ -23,7 +23,9 @@ from vlgs.training.workshop import Made, StoppedError, Workshop
 log = logging.getLogger(__name__)
 
 
-def train_learner(workshop: Workshop, name: str, learner: Learner, made: Field) -> None:
+def train_learner(
+    workshop: Workshop, name: str, learner: Learner, made: Field, gaussians: int = 0
+) -> None:
     """Train a learner in a sub-folder of a run, or read it back, and remember what it makes.
 
     Args:
@@ -31,6 +33,7 @@ def train_learner(workshop: Workshop, name: str, learner: Learner, made: Field) 
         name: Sub-folder; empty for the folder of the run itself.
         learner: New.
         made: What asks the learner's model.
+        gaussians: How many it has.
 
     Raises:
         StoppedError: If it was asked to stop.
@@ -45,7 +48,7 @@ def train_learner(workshop: Workshop, name: str, learner: Learner, made: Field) 
         raise StoppedError(stopped_by, where)
     learner.model.requires_grad_(False)
     size = checkpoint_bytes(folder.checkpoint)
-    workshop.made[name] = Made(folder, made, 0, learner.train_seconds, SkipCount(), size)
+    workshop.made[name] = Made(folder, made, gaussians, learner.train_seconds, SkipCount(), size)
 
 
 def _fit(learner: Learner, folder: RunFolder, options: FitOptions) -> str | None:

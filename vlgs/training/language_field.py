@@ -19,6 +19,7 @@ from vlgs.training.fit_learner import train_learner
 from vlgs.training.learner import Descent, Learner, generator_of
 from vlgs.training.radiance import NO_GAUSSIANS, rays_in
 from vlgs.training.ray_bank import RayBank
+from vlgs.training.second_map import SecondMap
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.stages import Progress
 from vlgs.training.workshop import Workshop
@@ -55,7 +56,9 @@ class TrainLanguageField:
     samples: int = 4
     """Of a ray, how many with the largest weights are asked for their features."""
     weight: float = 0.1
-    """Of the loss."""
+    """Of the loss of embeddings; that of the second map counts whole."""
+    second: SecondMap | None = None
+    """What stands in DINO's place: a map that the same features are to give too, so that they change where it does; None: nothing."""
     scales: int = 6
     """At how many physical scales a word is asked, among those that masks have; LERF asks at 30."""
     relevancy_at: float | None = None
@@ -124,35 +127,43 @@ class LanguageLearner(Learner):
         seed: int,
     ) -> None:
         width = scene.mask_vectors.shape[1]
-        model = LanguageField(stage.network, width, generator=generator_of(seed))
+        second = 0 if stage.second is None else stage.second.require(scene)
+        model = LanguageField(stage.network, width, second, generator_of(seed))
         super().__init__(model, settings, stage.descent, seed, stage.batches)
         self.radiance = [radiance]  # in a list, so that it is no part of this module
         self.vectors = scene.mask_vectors
-        self.bank = RayBank(scene.train)
+        self.bank = RayBank(scene.train, scene.points)
         self.rows = rows_of(scene)
         self.sides = mask_sides(self.rows, len(scene.mask_vectors))
         self.stage = stage
         self.rays = rays_in(self.bank, stage.rays)
+        self.low = None
+        if stage.second is not None:
+            self.low = torch.cat([stage.second.read(v).flatten(0, 1).half() for v in scene.train])
 
     def terms(self, draw: int, generator: torch.Generator) -> Mapping[str, Tensor]:
-        """Huber's loss between the embeddings of rays and the vectors of their masks."""
-        features, scale, rows = self._look(self.rays, generator)
+        """Huber's loss between the embeddings of rays and the vectors of their masks, and the squared error of the second map."""
+        features, scale, rows, pixels = self._look(self.rays, generator)
         seen = rows >= 0
         embeddings = self.model.embed(features[seen], scale[seen])
-        return {"language": self.stage.weight * huber(embeddings, self.vectors[rows[seen]])}
+        terms = {"language": self.stage.weight * huber(embeddings, self.vectors[rows[seen]])}
+        if self.low is not None:
+            error = self.model.low(features) - self.low[pixels]
+            terms["second"] = error.square().sum(-1).mean()
+        return terms
 
     @torch.no_grad()
     def scale_range(self) -> tuple[float, float]:
         """The physical scales between which nearly all masks of a sample of rays are."""
-        _, scale, rows = self._look(4096, generator_of(self.seed, 0, 1))
+        _, scale, rows, _ = self._look(4096, generator_of(self.seed, 0, 1))
         known = scale[rows >= 0]
         if not len(known):
             return 0.0, 0.0
         low, high = known.quantile(torch.tensor([0.05, 0.95])).tolist()
         return low, high
 
-    def _look(self, rays: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Features, physical scales and masks of random rays."""
+    def _look(self, rays: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Features, physical scales, masks and pixels of random rays."""
         radiance, drawn = self.radiance[0], self.bank.draw(rays, generator)
         level = torch.randint(self.rows.shape[1], drawn.pixels.shape, generator=generator)
         rows = self.rows[drawn.pixels, level].long()
@@ -160,12 +171,11 @@ class LanguageLearner(Learner):
             samples = radiance.sample(radiance.frame.inside(drawn.rays), generator)
             weights = radiance.weights(samples)
         features, distance = along(self.model, samples, weights, self.stage.samples)
-        return features, self.sides[rows] * distance / self.bank.K[drawn.views, 0, 0], rows
+        scale = self.sides[rows] * distance / self.bank.K[drawn.views, 0, 0]
+        return features, scale, rows, drawn.pixels
 
 
-def huber(
-    embeddings: Float[Tensor, "n e"], vectors: Float[Tensor, "n e"]
-) -> Float[Tensor, ""]:
+def huber(embeddings: Float[Tensor, "n e"], vectors: Float[Tensor, "n e"]) -> Float[Tensor, ""]:
     """Huber's loss, summed over the numbers of an embedding; the mean over pixels, and 0 of none."""
     loss = huber_loss(embeddings, vectors, delta=HUBER, reduction="sum")
     return loss / max(1, len(embeddings))

@@ -34,6 +34,10 @@ class Descent:
     """Of the last step, or of step `over`."""
     over: int | None = None
     """Steps over which it decays; None: all of the run."""
+    eps: float = 1e-15
+    """Added to the root of the second moment: rows of a table with gradients far below it stay where they are."""
+    beta2: float = 0.999
+    """Of the second moment."""
     decay: float = 0.0
     """Weight decay, added to the gradient."""
     clip: float | None = None
@@ -51,7 +55,9 @@ class Descent:
         """The optimiser of all that a model trains."""
         parameters = [p for p in model.parameters() if p.requires_grad]
         make = _OPTIMIZERS[self.optimizer]
-        return make(parameters, lr=self.rate, eps=1e-15, weight_decay=self.decay)
+        return make(
+            parameters, lr=self.rate, betas=(0.9, self.beta2), eps=self.eps, weight_decay=self.decay
+        )
 
     def at(self, step: int, steps: int) -> float:
         """The rate of a step, of so many.
@@ -112,9 +118,6 @@ class Learner(L.LightningModule):
             generator: What is random in this draw.
         """
 
-    def after(self) -> None:  # noqa: B027 (most have nothing to do)
-        """Called after each step of the optimiser."""
-
     @property
     def mse(self) -> float:
         """Mean squared error of colour in the last draw; NaN without colour."""
@@ -156,11 +159,12 @@ class Learner(L.LightningModule):
         for name, parameter in self.model.named_parameters():
             # Finite only if every number is.
             if parameter.grad is not None and not math.isfinite(parameter.grad.sum().item()):
-                raise FloatingPointError(f"train: gradient of {name} must be finite, got none {where}")
+                raise FloatingPointError(
+                    f"train: gradient of {name} must be finite, got none {where}"
+                )
         if self.descent.clip is not None:
             nn.utils.clip_grad_norm_(self.model.parameters(), self.descent.clip)
         self.optimizer.step()
-        self.after()
         return loss.item()
 
     def capture(self, meta: dict[str, Any]) -> Checkpoint:

@@ -44,7 +44,7 @@ class TrainRadiance:
     name: str = "radiance"
     """Of the sub-folder."""
     network: RadianceConfig = field(default_factory=RadianceConfig)
-    descent: Descent = field(default_factory=lambda: Descent("adam", 1e-2, 3e-4))
+    descent: Descent = field(default_factory=lambda: Descent("adam", 1e-2, 3e-4, beta2=0.99))
     rays: int = 1024
     """In a draw."""
     batches: int = 3
@@ -91,7 +91,7 @@ class RadianceLearner(Learner):
         model = RadianceField(stage.network, frame, generator_of(seed))
         model.expect((scene.points - frame.center) * frame.scale)
         super().__init__(model, settings, stage.descent, seed, stage.batches)
-        self.bank = RayBank(scene.train)
+        self.bank = RayBank(scene.train, scene.points)
         self.colors = pixels_of(scene.train)
         self.rays = rays_in(self.bank, stage.rays)
         self.spread = stage.spread
@@ -138,4 +138,4 @@ def frame_of(scene: Scene) -> Frame:
         distances = torch.cdist(centers, points) / radius
         near = 0.5 * distances.min().clamp(1e-3, 1).item()
         far = 1.1 * distances.median(dim=0).values.quantile(0.95).clamp_min(2 * near).item()
-    return Frame(center.float(), 1 / radius.item(), Spacing(near, far))
+    return Frame(center.float(), 1 / radius.item(), Spacing(near, far), scene.points)

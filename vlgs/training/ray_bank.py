@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from vlgs.fields.rays import Rays
+from vlgs.fields.radiance import nearest_of
+from vlgs.fields.rays import Rays, nearest_seen
 from vlgs.geometry import camera_center
 from vlgs.types import View
 
@@ -28,28 +29,36 @@ class RayBank:
 
     Args:
         views: At least one.
+        points: On surfaces; see `vlgs.fields.radiance.Frame.points`.
 
     Raises:
         ValueError: If no pixel of them is covered by a photograph.
     """
 
-    def __init__(self, views: Sequence[View]) -> None:
+    def __init__(self, views: Sequence[View], points: Float[Tensor, "p 3"]) -> None:
         cameras = [view.camera for view in views]
         viewmats = torch.stack([camera.viewmat for camera in cameras]).float()
         self.rotations = viewmats[:, :3, :3]
         self.centers = camera_center(viewmats)
         self.K = torch.stack([camera.K for camera in cameras]).float()
         self.widths = torch.tensor([camera.width for camera in cameras])
+        self.heights = torch.tensor([camera.height for camera in cameras])
+        self.nearest = torch.stack([nearest_seen(camera, points) for camera in cameras]).float()
         sizes = torch.tensor([camera.width * camera.height for camera in cameras])
         self.ends = sizes.cumsum(0)
         self.starts = self.ends - sizes
         masks = [view.read_valid and view.read_valid() for view in views]
         self.covered = None
         if any(mask is not None for mask in masks):
-            full = [torch.ones(n) if m is None else m for n, m in zip(sizes.tolist(), masks, strict=True)]
+            full = [
+                torch.ones(n) if m is None else m
+                for n, m in zip(sizes.tolist(), masks, strict=True)
+            ]
             self.covered = torch.cat([mask.flatten().bool() for mask in full]).nonzero()[:, 0]
         if self.count == 0:
-            raise ValueError("train: training views must have pixels that a photograph covers, got none")
+            raise ValueError(
+                "train: training views must have pixels that a photograph covers, got none"
+            )
 
     @property
     def count(self) -> int:
@@ -70,7 +79,9 @@ class RayBank:
         y = (within // width + 0.5 - K[:, 1, 2]) / K[:, 1, 1]
         ahead = torch.stack([x, y, torch.ones_like(x)], dim=-1)
         directions = (ahead[:, None] @ self.rotations[views])[:, 0]
-        return Drawn(Rays(self.centers[views], normalize(directions, dim=-1)), pixels, views)
+        near = nearest_of(self.nearest[views], width, self.heights[views], within)
+        rays = Rays(self.centers[views], normalize(directions, dim=-1), near)
+        return Drawn(rays, pixels, views)
 
 
 def pixels_of(views: Sequence[View]) -> UInt8[Tensor, "p 3"]:
