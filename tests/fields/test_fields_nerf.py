@@ -74,7 +74,7 @@ def test_samples_lie_where_something_was():
     field.keep(Samples(lengths, lengths, lengths, places), torch.full((1, 1), 1e4))
     ray = Rays(torch.tensor([[0.0, 0, -1]]), torch.tensor([[0.0, 0, 1]]))
     distances = field.sample(ray).distances[0]
-    assert ((distances > 0.9) & (distances < 2.1)).sum() >= 4
+    assert ((distances > 0.9) & (distances < 2.1)).sum() >= 3
 
 
 def test_features_of_a_ray_are_those_of_its_heaviest_samples():

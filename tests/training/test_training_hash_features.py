@@ -119,7 +119,7 @@ def test_a_step_draws_half_of_a_view_and_moves_the_networks_alone(
     assert all(p.grad is None for p in splats.parameters())
     assert all(p.grad is not None and p.grad.any() for p in learner.model.parameters())
 
-    index = next(iter(learner._kept))
+    index = next(iter(learner._rows))
     view, camera = learner._view(index), tiny_scene.train[index].camera
     gaussians = splats.gaussians()
     said = learner.model.embed(learner.model.features(learner.places))

@@ -57,11 +57,13 @@ class Killed(lightning.Callback):
     def __init__(self, model: int, step: int) -> None:
         self.left, self.step = model, step
 
-    def on_train_start(self, *args: Any) -> None:
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: Any) -> None:
         self.left -= 1
 
-    def on_train_batch_end(self, trainer: lightning.Trainer, module: Any, *args: Any) -> None:
-        if self.left == 0 and module.next_step == self.step:
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self.left == 0 and pl_module.next_step == self.step:
             raise RuntimeError("killed")
 
 
@@ -100,7 +102,7 @@ def test_stopped_in_either_stage_it_goes_on_to_the_same_bits(
 def test_a_loss_that_is_not_finite_ends_it_and_says_where(tiny_scene: Scene, tmp_path: Path):
     learner = RadianceLearner(tiny_scene, RADIANCE, SETTINGS, 0)
     with torch.no_grad():
-        learner.model.color_net[0].bias[0] = torch.nan
+        next(learner.model.color_net.parameters())[0] = torch.nan
     with pytest.raises(FloatingPointError, match="photometric must be finite, got nan in step 3"):
         learner.training_step(3, 0)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +11,7 @@ from torch.nn.functional import cosine_similarity, huber_loss, interpolate
 
 from vlgs.demands import Demand
 from vlgs.fields import Field
+from vlgs.fields.cached_weights import FrozenViews
 from vlgs.fields.hash_splat import HashSplatField
 from vlgs.fields.language_field import LanguageConfig, LanguageField
 from vlgs.fields.radiance import in_cube
@@ -135,7 +136,8 @@ class HashLearner(Learner):
             (splats.splats["means"].detach() - self.frame.center) * self.frame.scale
         )
         self.seen = [index for index, view in enumerate(scene.train) if view.read_masks is not None]
-        self._kept: dict[int, _View] = {}
+        self._views = FrozenViews(settings.skip.frozen_budget)
+        self._rows: dict[int, Tensor] = {}
 
     def terms(self, draw: int, generator: torch.Generator) -> Mapping[str, Tensor]:
         """The two maps of one view, and how they agree on which neighbours are alike."""
@@ -156,20 +158,24 @@ class HashLearner(Learner):
         return terms
 
     def _view(self, index: int) -> _View:
-        if index not in self._kept:
-            splats = self.splats[0]
-            with torch.no_grad():
-                gaussians = splats.gaussians()
-            given = self.scene.train[index].camera
-            width, height = (max(1, n // self.stage.shrink) for n in (given.width, given.height))
-            camera = resize_camera(given, width, height)
-            shape = gaussians.means, gaussians.quats, gaussians.scales
-            weight = gaussians.opacities * (gaussians.opacities > self.stage.opaque)
-            whole = FrozenView(*shape, weight, camera, splats.raster)
-            rows = whole.visible.nonzero()[:, 0]
-            part = FrozenView(*(t[rows] for t in (*shape, weight)), camera, splats.raster)
-            self._kept[index] = _View(part, rows)
-        return self._kept[index]
+        splats, given = self.splats[0], self.scene.train[index].camera
+        width, height = (max(1, n // self.stage.shrink) for n in (given.width, given.height))
+        camera = resize_camera(given, width, height)
+        with torch.no_grad():
+            gaussians = splats.gaussians()
+        weight = gaussians.opacities * (gaussians.opacities > self.stage.opaque)
+        means, quats, scales = gaussians.means, gaussians.quats, gaussians.scales
+        if index not in self._rows:
+            whole = FrozenView(means, quats, scales, weight, camera, splats.raster)
+            self._rows[index] = whole.visible.nonzero()[:, 0]
+        rows, view = self._rows[index], self._views.get(index)
+        if view is None:
+            part: dict[str, Any] = {"means": means[rows], "quats": quats[rows]}
+            part |= {"scales": scales[rows], "weight": weight[rows]}
+            part |= {"camera": camera, "config": splats.raster}
+            # Where there is no room for them, the weights of a view are made each time.
+            view = self._views.make(index, **part) or FrozenView(**part)
+        return _View(view, rows)
 
     def _vectors(self, index: int, size: torch.Size) -> tuple[Tensor, Tensor]:
         """Mean vector of the masks of each pixel over the mask levels, and where there is one."""
