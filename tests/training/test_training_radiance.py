@@ -35,7 +35,7 @@ from vlgs.types import Scene
 
 GRID = GridConfig(3, 2, 4, 16, 8)
 RADIANCE = TrainRadiance(
-    network=RadianceConfig(GRID, width=16, coarse=16, samples=8, cells=16), rays=64, batches=2
+    radiance=RadianceConfig(GRID, width=16, coarse=16, samples=8, cells=16), rays=64, batches=2
 )
 LANGUAGE = TrainLanguageField(
     "radiance", network=LanguageConfig([GRID], hidden=1, width=16), rays=64, scales=2

@@ -12,7 +12,7 @@ from vlgs.fields.radiance import RadianceField, Samples
 from vlgs.fields.similarity import CHUNK, cosines
 from vlgs.types import Camera
 
-RAYS = 4096
+RAYS = 2048
 """Rays that are rendered at once."""
 
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import cosine_similarity, huber_loss, interpolate
+from torch.nn.functional import huber_loss, interpolate, normalize
 
 from vlgs.demands import Demand
 from vlgs.fields import Field
@@ -138,6 +138,7 @@ class HashLearner(Learner):
         self.seen = [index for index, view in enumerate(scene.train) if view.read_masks is not None]
         self._views = FrozenViews(settings.skip.frozen_budget)
         self._rows: dict[int, Tensor] = {}
+        self._seconds: dict[int, Tensor] = {}
 
     def terms(self, draw: int, generator: torch.Generator) -> Mapping[str, Tensor]:
         """The two maps of one view, and how they agree on which neighbours are alike."""
@@ -189,8 +190,11 @@ class HashLearner(Learner):
         return vectors.sum(2) / valid.sum(2, keepdim=True).clamp_min(1), valid.any(2)
 
     def _second(self, index: int, size: torch.Size) -> Float[Tensor, "h w c"]:
-        target = self.stage.second.read(self.scene.train[index]).permute(2, 0, 1)[None]
-        return interpolate(target, tuple(size), mode="area")[0].permute(1, 2, 0)
+        if index not in self._seconds:
+            target = self.stage.second.read(self.scene.train[index]).permute(2, 0, 1)[None]
+            small = interpolate(target, tuple(size), mode="area")[0].permute(1, 2, 0)
+            self._seconds[index] = small.half()
+        return self._seconds[index].float()
 
 
 def embedding_loss(
@@ -215,15 +219,11 @@ def alignment_loss(
 
 def neighbour_cosines(image: Float[Tensor, "h w c"]) -> Float[Tensor, "8 ih iw"]:
     """Cosine of each inner pixel with its eight neighbours."""
+    unit = normalize(image, dim=-1, eps=1e-6)  # once for all pairs
     h, w, _ = image.shape
-    inner = image[1 : h - 1, 1 : w - 1]
+    inner = unit[1 : h - 1, 1 : w - 1]
     shifts = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
-    return torch.stack(
-        [
-            cosine_similarity(inner, image[y : y + h - 2, x : x + w - 2], dim=-1, eps=1e-6)
-            for y, x in shifts
-        ]
-    )
+    return torch.stack([(inner * unit[y : y + h - 2, x : x + w - 2]).sum(-1) for y, x in shifts])
 
 
 def _nearest(rows: Tensor, size: torch.Size) -> Tensor:

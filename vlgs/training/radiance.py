@@ -43,7 +43,7 @@ class TrainRadiance:
     demands: ClassVar[Sequence[Demand]] = NO_GAUSSIANS
     name: str = "radiance"
     """Of the sub-folder."""
-    network: RadianceConfig = field(default_factory=RadianceConfig)
+    radiance: RadianceConfig = field(default_factory=RadianceConfig)
     descent: Descent = field(default_factory=lambda: Descent("adam", 1e-2, 3e-4, beta2=0.99))
     rays: int = 1024
     """In a draw."""
@@ -88,7 +88,7 @@ class RadianceLearner(Learner):
         if not scene.train:
             raise ValueError(f"train: training views of {scene.name} must be at least 1, got 0")
         frame = frame_of(scene)
-        model = RadianceField(stage.network, frame, generator_of(seed))
+        model = RadianceField(stage.radiance, frame, generator_of(seed))
         model.expect((scene.points - frame.center) * frame.scale)
         super().__init__(model, settings, stage.descent, seed, stage.batches)
         self.bank = RayBank(scene.train, scene.points)
