@@ -40,7 +40,6 @@ NAMES = {
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
-    "second": "photograph",
     "stages": "lift train train_color train_hash_features train_language_field train_radiance",
     "text": "clip vocabulary",
     "trainer": "base",

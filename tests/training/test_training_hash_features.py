@@ -16,6 +16,7 @@ from vlgs.fields.language_field import LanguageConfig
 from vlgs.fields.radiance import in_cube
 from vlgs.geometry import resize_camera
 from vlgs.ops.rasterize import rasterize
+from vlgs.run import run
 from vlgs.runs import RunFolder
 from vlgs.training.fit import FitOptions
 from vlgs.training.hash_features import (
@@ -224,3 +225,10 @@ def test_maps_of_files_are_read_and_what_is_missing_is_named(tiny_scene: Scene, 
     first.unlink()
     with pytest.raises(ValueError, match="must be there, as every training view needs a map"):
         maps.require(tiny_scene)
+
+
+def test_a_scene_without_second_maps_is_refused_before_training(tmp_path: Path):
+    config = composed("method=fmgs", *TINY, "stages.1.second.folder=nowhere", f"results={tmp_path}")
+    with pytest.raises(ValueError, match=r"second map: nowhere/frame_\d+.npy must be there"):
+        run(config)
+    assert not (tmp_path / "runs").exists()

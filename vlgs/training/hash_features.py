@@ -74,6 +74,11 @@ class TrainHashFeatures:
         require_range("hash features", 1, 64, shrink=self.shrink)
         require_range("hash features", 0, 0.99, opaque=self.opaque)
 
+    def require(self, scene: Scene) -> None:
+        """Refuse a scene without the second maps that were asked for, before anything is trained."""
+        if len(scene.mask_vectors):
+            self.second.require(scene)
+
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
         """See `vlgs.training.stages.Stage`. A mask level without a single mask has colour alone."""
         models: dict[int | None, Field] = {}

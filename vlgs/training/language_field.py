@@ -70,6 +70,11 @@ class TrainLanguageField:
         require_range("language field", 1, 4096, samples=self.samples, scales=self.scales)
         require_range("language field", 0, 1e6, weight=self.weight, relevancy_at=self.relevancy_at)
 
+    def require(self, scene: Scene) -> None:
+        """Refuse a scene without the second maps that were asked for, before anything is trained."""
+        if self.second is not None and len(scene.mask_vectors):
+            self.second.require(scene)
+
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
         """See `vlgs.training.stages.Stage`. A mask level without a single mask has colour alone."""
         models: dict[int | None, Field] = {}

@@ -31,6 +31,19 @@ class SecondMap(Protocol):
         ...
 
 
+def choose_second_map(
+    folder: str | None = None, fine: float = 1.0, coarse: float = 4.0
+) -> SecondMap:
+    """Maps of a folder, or computed from the photographs.
+
+    Args:
+        folder: See `FolderMap`; None: a `PhotographMap`.
+        fine: See `PhotographMap`.
+        coarse: Likewise.
+    """
+    return PhotographMap(fine, coarse) if folder is None else FolderMap(folder)
+
+
 @dataclass(frozen=True)
 class PhotographMap:
     """Computed from the photograph itself: its CIELAB colour, blurred a little and blurred more, and where it has edges.

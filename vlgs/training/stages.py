@@ -90,6 +90,19 @@ class Stage(Protocol):
 
 
 @runtime_checkable
+class LooksAhead(Protocol):
+    """A stage that needs more of a scene than photographs and masks."""
+
+    def require(self, scene: Scene) -> None:
+        """Do nothing if the scene has it.
+
+        Raises:
+            ValueError: If it has not; before anything is trained.
+        """
+        ...
+
+
+@runtime_checkable
 class Stages(Protocol):
     """An option that contributes to the list of stages."""
 
@@ -134,6 +147,17 @@ class Method:
     def stages(self, language: bool) -> Sequence[Stage]:
         """See `Stages`."""
         return self.listed
+
+    def require(self, scenes: Iterable[Scene]) -> None:
+        """Ask the stages that need more of a scene whether it is there.
+
+        Raises:
+            ValueError: If a scene lacks something; it is named.
+        """
+        for stage in self.listed:
+            if isinstance(stage, LooksAhead):
+                for scene in scenes:
+                    stage.require(scene)
 
 
 def run_stages(
