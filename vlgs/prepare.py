@@ -65,6 +65,8 @@ def prepare(experiment: Experiment) -> Prepared:
     ready = Prepared(experiment, scenes, "")
     _require_sizes(ready.scene)
     experiment.augment.require(scenes)
+    if experiment.method is not None:
+        experiment.method.require(scenes)
     read = [ready.fingerprint, experiment.augment.identity()]
     read += [file_digest(path, key) for key, path in experiment.given_files.items()]
     return replace(ready, run_id=experiment.run_id(" ".join(filter(None, read))))

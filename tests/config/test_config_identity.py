@@ -41,7 +41,7 @@ NAMES = {
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
     "lift": "direction mean robust squared top_k",
-    "stages": "associate lift train train_color",
+    "stages": "associate lift train train_color train_hash_features train_language_field train_radiance",
     "text": "clip vocabulary",
     "trainer": "base",
 }

@@ -9,7 +9,7 @@ import lightning as L  # noqa: N812 (its own abbreviation)
 
 from vlgs.bench.presets import Trained
 from vlgs.bench.quality import score
-from vlgs.training.after_step import AfterStep
+from vlgs.training.after_step import AfterStep, TrainedModule
 from vlgs.training.lightning import VLGSModule
 
 
@@ -48,8 +48,9 @@ class Curve(AfterStep):
         """Start the clocks."""
         self.started = (time.perf_counter(), time.process_time())
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Stop the clocks, then evaluate if it is time."""
+        assert isinstance(module, VLGSModule)
         self.wall += time.perf_counter() - self.started[0]
         self.cpu += time.process_time() - self.started[1]
         if module.next_step not in self.at:

@@ -10,7 +10,8 @@ from torch import Tensor
 from vlgs.report.colors import to_uint8
 
 SAMPLE = 20_000
-"""Pixels per view that the axes and bounds are found from."""
+"""Pixels per view that the axes and bounds are found from, of features of up to `NARROW` numbers; of wider ones fewer, as memory grows."""
+NARROW = 16
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ def paint_features(
 
 def _sample(feature: Float[Tensor, "h w d"]) -> Float[Tensor, "p d"]:
     flat = feature.flatten(0, 1)
-    return flat[:: max(1, len(flat) // SAMPLE)]
+    sample = SAMPLE * NARROW // max(NARROW, flat.shape[1])
+    return flat[:: max(1, len(flat) // sample)].clone()  # a view would keep the whole image
 
 
 def _principal_axes(pixels: Float[Tensor, "p d"]) -> Float[Tensor, "d 3"]:

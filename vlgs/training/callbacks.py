@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -15,9 +16,10 @@ import lightning as L
 from vlgs.files import write_atomically
 from vlgs.gaussians import densify, reset_opacity
 from vlgs.runs import RunFolder, stop_signals
-from vlgs.training.after_step import AfterStep, own
+from vlgs.training.after_step import AfterStep, TrainedModule, own
 from vlgs.training.checkpoint import save_checkpoint
 from vlgs.training.curves import COLUMNS, csv_lines, read_rows
+from vlgs.training.learner import Learner
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.silence import silence
 from vlgs.training.state import capture
@@ -26,8 +28,9 @@ from vlgs.training.state import capture
 class Densification(AfterStep):
     """Clone, split, prune and reset, from the two real views of each iteration (conf/README.md, D.10 and D.11)."""
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Gather the screen gradients of this iteration, then change the Gaussians when it is time."""
+        assert isinstance(module, VLGSModule)
         densifying, done = module.densifying, module.next_step
         config = densifying.config
         if done >= config.densify.stop:
@@ -57,8 +60,9 @@ class Densification(AfterStep):
 class Silence(AfterStep):
     """After the last iteration, take the codes of what lies outside of masks (`vlgs.training.silence`)."""
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Do so when it is time."""
+        assert isinstance(module, VLGSModule)
         share, features = module.densifying.config.silent_above, module.model.splats["features"]
         done = module.next_step == module.settings.iterations
         if done and share < 1 and module.views.has_language and features.requires_grad:
@@ -71,7 +75,7 @@ class OwnFolder(AfterStep):
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Check that the folder is still the same."""
         self.folder.require_own()
 
@@ -89,7 +93,7 @@ class Checkpoints(AfterStep):
         """Note that the resumed step is saved already."""
         self.saved = own(pl_module).next_step
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Save when it is time."""
         if self.every and module.next_step % self.every == 0:
             self._save(module)
@@ -98,9 +102,10 @@ class Checkpoints(AfterStep):
         """Save what was reached."""
         self._save(own(pl_module))
 
-    def _save(self, module: VLGSModule) -> None:
+    def _save(self, module: TrainedModule) -> None:
         if module.next_step != self.saved:
-            save_checkpoint(self.folder, capture(module, self.meta))
+            state = module.capture if isinstance(module, Learner) else partial(capture, module)
+            save_checkpoint(self.folder, state(self.meta))
             self.saved = module.next_step
 
 
@@ -113,7 +118,7 @@ class TrainingClock(AfterStep):
         """Start the clock of this iteration."""
         self.started = time.perf_counter()
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Add this iteration and its densification."""
         module.train_seconds += time.perf_counter() - self.started
 
@@ -132,7 +137,7 @@ class CurveLog(AfterStep):
             rows = [row for row in read_rows(self.path) if int(row[0]) <= step]
         write_atomically(self.path, csv_lines([COLUMNS, *rows]).encode())
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Write a row when it is time."""
         if module.next_step % self.every:
             return
@@ -140,7 +145,7 @@ class CurveLog(AfterStep):
         row = {
             "loss": report.loss,
             "psnr": psnr_of(report.color_mse),
-            "n_gaussians": module.model.count,
+            "n_gaussians": module.count,
             "blend_weight": report.log.get("blend_weight", 0.0),
             "seconds": module.train_seconds,
         }
@@ -168,7 +173,7 @@ class ProgressLine(AfterStep):
             BarColumn(bar_width=12),
             MofNCompleteColumn(),
             TextColumn(
-                "loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]:,} Gaussians"
+                "loss {task.fields[loss]:.4f}  psnr {task.fields[psnr]:.2f} dB  {task.fields[count]}"
             ),
             TimeRemainingColumn(compact=True),
             TextColumn("left"),
@@ -186,12 +191,12 @@ class ProgressLine(AfterStep):
             completed=module.next_step,
             loss=0.0,
             psnr=0.0,
-            count=module.model.count,
+            count=_gaussians(module.count),
         )
         with suppress(OSError):
             self.bar.start()
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Redraw when a quarter of a second has passed."""
         report = module.report
         self.mse = (
@@ -206,7 +211,7 @@ class ProgressLine(AfterStep):
             completed=module.next_step,
             loss=report.loss,
             psnr=psnr_of(self.mse),
-            count=module.model.count,
+            count=_gaussians(module.count),
         )
         with suppress(OSError):  # a closed terminal must not end a training
             self.bar.refresh()
@@ -273,6 +278,10 @@ def _leave_closed_terminal(terminals: list[int]) -> None:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, descriptor)
             os.close(nowhere)
+
+
+def _gaussians(count: int) -> str:
+    return f"{count:,} Gaussians" if count else ""
 
 
 def psnr_of(mse: float) -> float:

@@ -22,6 +22,7 @@ from vlgs.training.callbacks import (
     TrainingClock,
 )
 from vlgs.training.checkpoint import keep_from, load_checkpoint
+from vlgs.training.learner import Learner
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.state import restore
 from vlgs.training.zero_gradients import StuckAlarm
@@ -42,10 +43,10 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
-class _Steps:
+class Steps:
     """The iterations that remain, as Lightning wants its batches."""
 
-    module: VLGSModule
+    module: VLGSModule | Learner
 
     def __iter__(self) -> Iterator[int]:
         return iter(range(self.module.next_step, self.module.settings.iterations))
@@ -70,7 +71,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
         restore(module, checkpoint)
         keep_from(folder.checkpoint, checkpoint.step)
         log.info("resuming %s at step %d", folder.path, module.next_step)
-    steps = _Steps(module)
+    steps = Steps(module)
     if len(steps) == 0:
         return None
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -88,12 +89,14 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     if options.progress:
         callbacks.append(ProgressLine())
     callbacks += options.callbacks
-    with _expected_warnings():
-        _trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
+    with expected_warnings():
+        lightning_trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
     return stop.stopped_by
 
 
-def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions) -> L.Trainer:
+def lightning_trainer(
+    folder: RunFolder, callbacks: list[L.Callback], options: FitOptions
+) -> L.Trainer:
     """A Trainer with our own callbacks for checkpoints, curves and progress, and none of Lightning's."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -110,7 +113,7 @@ def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions
 
 
 @contextmanager
-def _expected_warnings() -> Iterator[None]:
+def expected_warnings() -> Iterator[None]:
     """Silence two warnings of Lightning that are expected here."""
     with warnings.catch_warnings():
         # The head is fitted before training starts; its BatchNorm must keep the statistics it has.

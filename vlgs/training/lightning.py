@@ -92,6 +92,11 @@ class VLGSModule(L.LightningModule):
         self.train_seconds = 0.0
         self.report = StepReport()
 
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return self.model.count
+
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """The one Adam; its groups are named after the parameters."""
         return self.optimizer

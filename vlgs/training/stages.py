@@ -155,6 +155,16 @@ class Method:
         """See `Stages`."""
         return self.listed
 
+    def require(self, scenes: Mapping[Level, Scene]) -> None:
+        """Refuse scenes that a stage cannot learn from.
+
+        Raises:
+            ValueError: If a scene lacks something; it is named.
+        """
+        for stage in self.listed:
+            if isinstance(stage, Particular):
+                stage.require(scenes)
+
 
 def run_stages(
     options: Iterable[Stages], scenes: Mapping[Level, Scene], workshop: Workshop
@@ -168,15 +178,10 @@ def run_stages(
 
     Raises:
         StoppedError: If training was asked to stop.
-        ValueError: If a stage needs what the scenes do not have (`Particular`).
     """
     language = any(len(scene.mask_vectors) for scene in scenes.values())
     progress = Progress(scenes if language else dict(list(scenes.items())[-1:]))
-    stages = list(list_stages(options, language))
-    for stage in stages:
-        if isinstance(stage, Particular):
-            stage.require(scenes)
-    for stage in stages:
+    for stage in list_stages(options, language):
         progress = stage.run(progress, workshop)
     return progress
 

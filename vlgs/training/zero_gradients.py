@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vlgs.training.after_step import AfterStep
+from vlgs.training.after_step import AfterStep, TrainedModule
 from vlgs.training.lightning import VLGSModule
 from vlgs.types import Camera
 
@@ -57,8 +57,9 @@ class StuckAlarm(AfterStep):
         self.alarmed: set[str] = set()
         self.in_a_row: dict[str, int] = {}
 
-    def after_step(self, module: VLGSModule) -> None:
+    def after_step(self, module: TrainedModule) -> None:
         """Look at the gradients of this iteration; runs before densification replaces the parameters."""
+        assert isinstance(module, VLGSModule)
         if module.next_step % self.every:
             return
         means2d = [render.mean2d for render in module.report.renders]
