@@ -38,7 +38,7 @@ def chosen(tmp_path: Path):
     """Composes a command line of somebody with two methods of their own."""
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "features.yaml").write_text(FEATURES)
-    (tmp_path / "method" / "lift.yaml").write_text(LIFT)
+    (tmp_path / "method" / "lifted.yaml").write_text(LIFT)
     path = f"hydra.searchpath=[file://{tmp_path}]"
     return lambda *overrides: composed(path, *TINY, *overrides)
 
@@ -63,7 +63,7 @@ def test_what_a_method_trains_moves_the_id_and_the_name_of_a_class_does_not(chos
     axes = ("fusion=none", "indicator=opacity", "blend=none", "levels=joint")
     plain, features, lift = (
         identity(chosen(*overrides)).recipe
-        for overrides in (axes, ("method=features",), ("method=lift",))
+        for overrides in (axes, ("method=features",), ("method=lifted",))
     )
     assert len({plain, features, lift}) == 3
     kinds = [
@@ -93,7 +93,7 @@ def test_a_method_runs(chosen, tmp_path: Path):
     ("overrides", "message"),
     [
         (["method=features", "sharing=none"], "sharing must be pos or pos_cov with stages of a method, as .*, got none"),
-        (["method=lift", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
+        (["method=lifted", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
         (["method=gs3d", "fusion=self"], "fusion must be none with a method of colour alone, as there is no language, got self"),
         (["method=gs3d", "indicator=learned"], "indicator must be fixed or opacity with a method of colour alone"),
         (["stages=[3]"], "config: stages must be a list of stages, got"),

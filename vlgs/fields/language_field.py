@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from vlgs.fields.hash_grid import GridConfig, HashGrid
 from vlgs.fields.radiance import mlp
+from vlgs.heads.rows import layers
 from vlgs.values import require_fields, require_range
 
 
@@ -81,12 +82,12 @@ class LanguageField(nn.Module):
             size = torch.as_tensor(scale, dtype=features.dtype).expand(len(features))
             features = torch.cat([features, size[:, None]], dim=-1)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.config.half):
-            raw = self.head(features)
+            raw = layers(self.head, features)
         return normalize(raw.to(features.dtype), dim=-1, eps=1e-6)
 
     def low(self, features: Float[Tensor, "n w"]) -> Float[Tensor, "n c"]:
         """The second map of features."""
         assert self.second is not None
         with torch.autocast("cpu", torch.bfloat16, enabled=self.config.half):
-            raw = self.second(features)
+            raw = layers(self.second, features)
         return raw.to(features.dtype)

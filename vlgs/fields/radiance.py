@@ -11,6 +11,7 @@ from torch.nn.functional import max_pool3d
 
 from vlgs.fields.hash_grid import GridConfig, HashGrid, contract
 from vlgs.fields.rays import Rays, Spacing, importance, nearest_seen, pixel_rays, ray_weights
+from vlgs.heads.rows import layers
 from vlgs.types import Camera
 from vlgs.values import require_fields, require_range
 
@@ -155,7 +156,7 @@ class RadianceField(nn.Module):
         self, places: Float[Tensor, "n 3"]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n g"]]:
         """Density at places of the cube, per unit of the ball, and what the colour's network is told of them."""
-        out = self.density_net(self.grid(places))
+        out = layers(self.density_net, self.grid(places))
         return torch.exp((out[:, 0] - _FOG).clamp_max(_HIGHEST)), out[:, 1:]
 
     def weights(self, samples: Samples) -> Float[Tensor, "r s"]:
@@ -171,7 +172,7 @@ class RadianceField(nn.Module):
         density = density.view_as(samples.distances)
         weights = ray_weights(density, samples.lengths)
         directions = harmonics(rays.directions)[:, None].expand(*density.shape, -1).flatten(0, 1)
-        color = torch.sigmoid(self.color_net(torch.cat([geometry, directions], dim=-1)))
+        color = layers(self.color_net, torch.cat([geometry, directions], dim=-1)).sigmoid()
         return (weights[..., None] * color.view(*density.shape, 3)).sum(dim=1), weights, density
 
     @torch.no_grad()
@@ -215,7 +216,7 @@ def nearest_of(
 
 def mlp(widths: list[int], generator: torch.Generator | None = None) -> nn.Sequential:
     """Linear layers with ReLU between them, with He's initial weights and no bias at first."""
-    layers: list[nn.Module] = []
+    parts: list[nn.Module] = []
     for inner, outer in pairwise(widths):
         layer = nn.Linear(inner, outer)
         with torch.no_grad():
@@ -223,8 +224,8 @@ def mlp(widths: list[int], generator: torch.Generator | None = None) -> nn.Seque
                 torch.randn(outer, inner, generator=generator) * math.sqrt(2 / inner)
             )
             layer.bias.zero_()
-        layers += [layer, nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+        parts += [layer, nn.ReLU()]
+    return nn.Sequential(*parts[:-1])
 
 
 def harmonics(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 16"]:

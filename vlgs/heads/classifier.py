@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.heads.rows import linear_rows
 from vlgs.values import require_choice, require_range
 
 
@@ -68,7 +69,7 @@ class Classifier(nn.Module):
 
     def logits(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b classes"]:
         """Of every mask, and of nothing as the last."""
-        return self.map(codes)
+        return linear_rows(codes, self.map.weight, self.map.bias)
 
     def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m e"]:
         """The embeddings as they are."""

@@ -142,8 +142,9 @@ class NeighbourClasses(Objective):
         self, codes: Float[Tensor, "s levels d"], near: Float[Tensor, "s k levels d"]
     ) -> Float[Tensor, ""]:
         """The term of codes and those of their neighbours."""
-        own = self.head.logits(codes).softmax(dim=-1)[:, None]
-        others = self.head.logits(near).softmax(dim=-1)
+        # The gradient of softmax has other bits on more threads.
+        own = self.head.logits(codes).log_softmax(dim=-1).exp()[:, None]
+        others = self.head.logits(near).log_softmax(dim=-1).exp()
         divergence = (own * ((own + SURE).log() - (others + SURE).log())).sum(dim=-1)
         return self.weight / self.head.classes * divergence.mean()
 

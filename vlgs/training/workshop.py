@@ -14,12 +14,12 @@ from vlgs.fields.trained import SplatField
 from vlgs.runs import RunFolder
 from vlgs.skip_count import SkipCount
 from vlgs.training.build import Parts, build_module
-from vlgs.training.checkpoint import checkpoint_bytes, save_checkpoint
+from vlgs.training.checkpoint import checkpoint_bytes, load_checkpoint, save_checkpoint
 from vlgs.training.fit import FitOptions, fit
 from vlgs.training.lift import lift_features
 from vlgs.training.lift_rules import LiftRule, lift_by
 from vlgs.training.lightning import VLGSModule
-from vlgs.training.state import capture
+from vlgs.training.state import capture, restore
 from vlgs.types import Scene
 
 log = logging.getLogger(__name__)
@@ -112,7 +112,7 @@ class Workshop:
     def lift(
         self, name: str, scene: Scene, start: SplatModel, rule: LiftRule | None = None
     ) -> SplatField:
-        """Lift the language of a scene onto finished Gaussians; the folder is as that of a trained model.
+        """Lift the language of a scene onto finished Gaussians, or read it back; the folder is as that of a trained model.
 
         Args:
             name: Sub-folder; empty for the folder of the run itself.
@@ -122,6 +122,10 @@ class Workshop:
         """
         folder, started = self.folder.part(name), time.perf_counter()
         module = self._build(scene, self.make_parts(), start)
+        finished = load_checkpoint(folder.checkpoint)
+        if finished is not None:
+            restore(module, finished)
+            return self._remember(name, module)
         module.model.sh_degree = start.sh_degree
         lift_features(module) if rule is None else lift_by(rule, module)
         module.next_step = module.settings.iterations
