@@ -64,9 +64,11 @@ GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 
 AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.background": 0,
+    "gaussians.densify.strays": False,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "stages": None,
     "trainer.exposure": False,
+    "trainer.language_decay": 1,
     "trainer.learning_rates.exposure": 1e-3,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while
