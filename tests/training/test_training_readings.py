@@ -133,10 +133,10 @@ def test_air_is_cleared_in_the_end_of_what_colour_cannot_see(tiny_scene: Scene):
     after = module.model.render(camera)
     assert before.color is not None
     assert after.color is not None
-    assert before.feature is not None
-    assert after.feature is not None
+    assert before.alpha_language is not None
+    assert after.alpha_language is not None
     assert torch.equal(after.color, before.color)
-    assert not torch.equal(after.feature, before.feature)
+    assert not torch.equal(after.alpha_language, before.alpha_language)
 
 
 @pytest.mark.parametrize("k", [0.2, 0.8])
