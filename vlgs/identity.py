@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vlgs.known import OPEN, former, is_group, join, last, option, targets
 
-RESULTS_VERSION = 4
+RESULTS_VERSION = 5
 """Part of every run id; raised by a change that can move a number."""
 
 _MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
