@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vlgs.known import OPEN, former, is_group, join, last, option, targets
 
-RESULTS_VERSION = 4
+RESULTS_VERSION = 5
 """Part of every run id; raised by a change that can move a number."""
 
 _MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
@@ -67,9 +67,11 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes": "none",
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
+    "gaussians.densify.strays": False,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "stages": None,
     "trainer.exposure": False,
+    "trainer.language_decay": 1,
     "trainer.learning_rates.exposure": 1e-3,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while

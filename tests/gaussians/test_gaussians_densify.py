@@ -15,6 +15,7 @@ from vlgs.gaussians import (
     GaussiansConfig,
     activate,
     densify,
+    remove,
     reset_opacity,
 )
 from vlgs.geometry import quat_to_rotmat
@@ -115,6 +116,32 @@ def test_pruned_rows_take_their_moments_with_them():
     assert report == DensifyReport(cloned=0, split=0, pruned=1, count=19)
     moments = optimizer.state[params["indicator_logits"]]["exp_avg"]
     torch.testing.assert_close(moments, 0.1 * torch.tensor([1.0, 2, 3, *range(5, 21)]))
+
+
+def test_strays_go_whatever_their_weight_and_gradient():
+    params = make(20)
+    strays, state = torch.arange(20) == 7, state_of([HOT] * 20)
+    report = densify(
+        params, adam(params), state, GaussiansConfig(), EXTENT, 0, EARLY, strays=strays
+    )
+    assert report == DensifyReport(cloned=19, split=0, pruned=1, count=38)
+    assert not (params["means"] == make(20)["means"][7]).all(dim=1).any()
+
+
+def test_removed_rows_take_their_moments_with_them_and_some_are_left():
+    params, before = make(20), make(20)
+    optimizer, state = adam(params), state_of([HOT] * 20)
+    step_once(params, optimizer)
+    remove(params, optimizer, state, torch.arange(20) == 3)
+    torch.testing.assert_close(params["sh0"][3], before["sh0"][4], rtol=0, atol=2e-3)  # a step off
+    moments = optimizer.state[params["indicator_logits"]]["exp_avg"]
+    torch.testing.assert_close(moments, 0.1 * torch.tensor([1.0, 2, 3, *range(5, 21)]))
+    assert state.grad_sum.tolist() == [0.0] * 19
+    kept = params["means"]
+    remove(params, optimizer, state, torch.zeros(19, dtype=torch.bool))
+    assert params["means"] is kept
+    remove(params, optimizer, state, torch.ones(19, dtype=torch.bool))
+    assert len(params["means"]) == 16
 
 
 def test_split_replaces_the_parent_by_two_smaller_ones_drawn_from_it():

@@ -10,6 +10,7 @@ from tiny_runs import TINY, composed
 from vlgs.config import instantiate
 from vlgs.geometry import camera_center
 from vlgs.training.build import Parts, build_module
+from vlgs.training.callbacks import ClearAir
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.settings import LearningRates, TrainerConfig
 from vlgs.types import Scene
@@ -95,6 +96,45 @@ def test_positions_slow_down_over_the_steps_they_are_given():
     assert longer.means_rate(1000) == pytest.approx((rates.means * rates.means_final) ** 0.5)
     with pytest.raises(ValueError, match="means_steps must be at least 1, got 0"):
         TrainerConfig(1000, rates, means_steps=0)
+
+
+def test_codes_and_indicators_slow_down_along_half_a_cosine(tiny_scene: Scene):
+    settings = TrainerConfig(1000, LearningRates(), language_decay=0.1)
+    shares = [settings.language_rate(step) for step in (0, 500, 1000, 2000)]
+    assert shares == pytest.approx([1, 0.55, 0.1, 0.1])
+    assert TrainerConfig(1000, LearningRates()).language_rate(700) == 1
+    module = module_of(tiny_scene, "trainer.iterations=100", "trainer.language_decay=0.1")
+    module.set_schedule(50)
+    rates = {group["name"]: group["lr"] for group in module.optimizer.param_groups}
+    assert rates["features"] == pytest.approx(0.55 * 5e-3)
+    assert rates["indicator_logits"] == pytest.approx(0.55 * 5e-2)
+    assert rates["opacity_logits"] == 5e-2
+    with pytest.raises(ValueError, match="language_decay must be"):
+        TrainerConfig(1000, LearningRates(), language_decay=1.5)
+
+
+def test_air_is_cleared_in_the_end_of_what_colour_cannot_see(tiny_scene: Scene):
+    module = module_of(tiny_scene, "gaussians.densify.strays=true")
+    camera, splats = tiny_scene.train[0].camera, module.model.splats
+    axis = camera.viewmat[:3, :3].T @ torch.tensor([0.0, 0.0, 0.05])
+    with torch.no_grad():
+        splats["means"][:2] = camera_center(camera.viewmat) + axis
+        splats["opacity_logits"][:3] = torch.tensor([-6.0, 2.0, -6.0])  # the third is where it was
+        splats["indicator_logits"][:2] = 4.0
+    before = module.model.render(camera)
+    n, module.next_step = module.model.count, module.settings.iterations - 1
+    ClearAir().after_step(module)
+    assert module.model.count == n
+    module.next_step += 1
+    ClearAir().after_step(module)
+    assert module.model.count == n - 1
+    after = module.model.render(camera)
+    assert before.color is not None
+    assert after.color is not None
+    assert before.alpha_language is not None
+    assert after.alpha_language is not None
+    assert torch.equal(after.color, before.color)
+    assert not torch.equal(after.alpha_language, before.alpha_language)
 
 
 @pytest.mark.parametrize("k", [0.2, 0.8])

@@ -2,7 +2,7 @@
 
 from vlgs.gaussians.attributes import STANDARD, Attribute, Attributes, attributes_of
 from vlgs.gaussians.config import AttributeConfig, DensifyConfig, GaussiansConfig
-from vlgs.gaussians.densify import DensifyReport, DensifyState, densify, reset_opacity
+from vlgs.gaussians.densify import DensifyReport, DensifyState, densify, remove, reset_opacity
 from vlgs.gaussians.init import initialise
 from vlgs.gaussians.parameters import activate, conform
 from vlgs.gaussians.ply import read_ply, write_ply
@@ -26,6 +26,7 @@ __all__ = [
     "densify",
     "initialise",
     "read_ply",
+    "remove",
     "reset_opacity",
     "rgb_to_sh",
     "sh_to_rgb",

@@ -30,6 +30,9 @@ class DensifyConfig:
     """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
     prune_below: float = 0.005
     """Weight under which a Gaussian is removed; see `GaussiansConfig.prune_on`."""
+    strays: bool = False
+    """Whether Gaussians that no training view has the centre of, or that only language sees before a camera, are removed
+    (`vlgs.gaussians.strays`)."""
     prune_large: bool = True
     """Whether Gaussians above `max_scale_share` are removed, once the first opacity reset has passed."""
     max_scale_share: float = 0.1

@@ -146,12 +146,13 @@ def _random_points(
         y = (v[own] * camera.height - cy) / fy * depth[own]
         in_camera = torch.stack([x, y, depth[own]], dim=1)
         points[own] = (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
-    seen = torch.stack([_in_view(points, camera) for camera in cameras]).sum(dim=0)
+    seen = torch.stack([in_view(points, camera) for camera in cameras]).sum(dim=0)
     # A stable sort leaves equally visible candidates in their random order.
     return points[seen.argsort(descending=True, stable=True)[:count]]
 
 
-def _in_view(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
+def in_view(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
+    """Which points lie in front of the camera and within its image."""
     viewmat, K = camera.viewmat.float(), camera.K.float()
     in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     x, y, depth = (in_camera @ K.T).unbind(-1)

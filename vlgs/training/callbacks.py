@@ -14,7 +14,7 @@ from typing import Any
 import lightning as L
 
 from vlgs.files import write_atomically
-from vlgs.gaussians import densify, reset_opacity
+from vlgs.gaussians import densify, remove, reset_opacity
 from vlgs.runs import RunFolder, stop_signals
 from vlgs.training.after_step import AfterStep, TrainedModule, own
 from vlgs.training.checkpoint import save_checkpoint
@@ -52,9 +52,27 @@ class Densification(AfterStep):
                 done,
                 densifying.centers,
                 module.model.attributes,
+                module.strays(),
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)
+
+
+class ClearAir(AfterStep):
+    """After the last iteration, remove what only language sees before a camera (`vlgs.gaussians.strays`).
+
+    Colour loses nothing. Gaussians out of view stay, as the margins of views would lose them with nothing to take their place.
+    """
+
+    def after_step(self, module: TrainedModule) -> None:
+        """Do so when it is time, where positions were trained and Gaussians could come and go."""
+        assert isinstance(module, VLGSModule)
+        densifying, splats = module.densifying, module.model.splats
+        done = module.next_step == module.settings.iterations
+        if not done or densifying.strays is None or densifying.config.densify.stop == 0:
+            return
+        gone = densifying.strays.in_air(splats["means"], module.faint())
+        remove(splats, module.optimizer, densifying.state, gone)
 
 
 class Silence(AfterStep):

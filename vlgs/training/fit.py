@@ -13,6 +13,7 @@ from lightning.pytorch.loggers import Logger
 from vlgs.runs import RunFolder
 from vlgs.training.callbacks import (
     Checkpoints,
+    ClearAir,
     CurveLog,
     Densification,
     GracefulStop,
@@ -80,6 +81,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
         OwnFolder(folder),  # before whatever writes
         StuckAlarm(module.settings.log_every),
         Densification(),
+        ClearAir(),
         Silence(),
         TrainingClock(),  # ends an iteration after its densification
         CurveLog(folder.curves, module.settings.log_every),

@@ -7,12 +7,13 @@ from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.gaussians.ply import SH_COEFFICIENTS
+from vlgs.gaussians.strays import Strays
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
@@ -34,6 +35,8 @@ class Densifying:
     """`vlgs.geometry.scene_extent` of the training cameras."""
     centers: Float[Tensor, "v 3"]
     """Of the training cameras."""
+    strays: Strays | None
+    """Finds Gaussians to remove; None: none is looked for."""
 
 
 class VLGSModule(L.LightningModule):
@@ -75,6 +78,7 @@ class VLGSModule(L.LightningModule):
             DensifyState.zeros(model.count),
             scene_extent(viewmats),
             camera_center(viewmats).float(),
+            Strays(views.scene) if config.densify.strays else None,
         )
         color = any("color" in objective.needs for objective in setup.objectives.values())
         keeps = settings.skip.frozen_weights and not model.evaluated
@@ -134,6 +138,16 @@ class VLGSModule(L.LightningModule):
             tuple(target.image for target in done.seen.targets),
         )
 
+    def faint(self) -> Bool[Tensor, " n"]:
+        """Gaussians that colour cannot see: no opacity above the contribution from which on they are drawn."""
+        opacities = self.model.splats["opacity_logits"].detach().sigmoid()
+        return opacities < self.model.raster.alpha_min
+
+    def strays(self) -> Bool[Tensor, " n"] | None:
+        """Gaussians to remove, or None where none is looked for."""
+        find = self.densifying.strays
+        return None if find is None else find(self.model.splats["means"], self.faint())
+
     def _make_optimizer(self) -> torch.optim.Adam:
         groups = [
             {"params": [parameter], "lr": self.model.attributes[name].rate, "name": name}
@@ -151,10 +165,13 @@ class VLGSModule(L.LightningModule):
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def set_schedule(self, step: int) -> None:
-        """The positions' rate and the degree of harmonics of a step."""
+        """The rates that decay, and the degree of harmonics, of a step."""
         for group in self.optimizer.param_groups:
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.densifying.extent
+            if group["name"] in ("features", "indicator_logits"):
+                rate = self.model.attributes[group["name"]].rate
+                group["lr"] = rate * self.settings.language_rate(step)
         highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.densifying.config.init is not None or "shN" in self.settings.freeze

@@ -1,5 +1,6 @@
 """Settings of a training run, mirrored by conf/trainer."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
@@ -75,6 +76,8 @@ class TrainerConfig:
     """Iterations after which the next spherical harmonics degree joins."""
     means_steps: int | None = None
     """Iterations over which the rate of the positions decays; None: all of the run (conf/README.md, D.11)."""
+    language_decay: float = 1.0
+    """Share of their rates that codes and indicators have left in the end, after half a cosine over the run; 1: they stay."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
@@ -92,6 +95,7 @@ class TrainerConfig:
                 f"{self.sh_every}, {self.log_every}, {self.checkpoint_every}"
             )
 
+        require_range("trainer", 0, 1, language_decay=self.language_decay)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
 
@@ -102,3 +106,8 @@ class TrainerConfig:
         if rates.means == 0 or rates.means_final == 0:
             return rates.means * (1 - share) + rates.means_final * share  # no logarithm leads to 0
         return rates.means * (rates.means_final / rates.means) ** share
+
+    def language_rate(self, step: int) -> float:
+        """Share of their rates that codes and indicators have at a step."""
+        fallen = (1 - math.cos(math.pi * min(step / self.iterations, 1.0))) / 2
+        return 1 + (self.language_decay - 1) * fallen
