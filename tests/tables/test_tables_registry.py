@@ -21,7 +21,7 @@ def runnable_rows() -> list[tuple[str, ...]]:
         {
             row.overrides
             for table in TABLES.values()
-            for row in table.runnable
+            for row in table.rows
             if row.overrides is not None
         }
     )
@@ -129,7 +129,7 @@ def test_a_table_is_read(tmp_path: Path):
         ),
         ("[miou]", "[moiu]", "metrics must be of .*, got 'moiu'"),
         ("set: []", "set: fusion=none", "rows\\[0\\]: set must be a list"),
-        ("set: []", "method: goi, set: []", "rows\\[0\\]: must have either set or method"),
+        ("set: []", "group: A", "rows\\[0\\]: must have set, got keys"),
         ("ramen: 1.5", "raman: 1.5", "paper must have columns of avg, ramen, got 'raman'"),
         ("ramen: 1.5", "ramen: high", "paper must give numbers for miou, got miou: 'high'"),
         ("metrics: [miou]", "metrics: [miou", "must be YAML"),

@@ -45,7 +45,7 @@ def plan(
     wanted: dict[tuple[RunIdentity, str], tuple[tuple[str, ...], list[str]]] = {}
     for seed in benchmark.seeds:
         for table in tables:
-            for row in table.runnable:
+            for row in table.rows:
                 assert row.overrides is not None
                 title = f"{table.label}: {row.label}"
                 try:

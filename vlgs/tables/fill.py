@@ -60,7 +60,7 @@ class Filled:
     kinds: Mapping[str, str]
     """Category column -> kind; empty for a table by scene."""
     recipes: Mapping[int, str]
-    """Row -> recipe of its runs, for rows that can be run."""
+    """Row -> recipe of its runs."""
     same_scenes: bool
     """Whether the scenes are the paper's, so that its values can be set against ours."""
     cells: Mapping[Place, Cell]
@@ -127,11 +127,9 @@ def printed_name(category: str) -> str:
 
 
 def _rows(table: Table, benchmark: Benchmark, composer: Composer) -> pd.DataFrame:
-    """Number, recipe and data recipe of the rows that can be run."""
+    """Number, recipe and data recipe of every row."""
     rows = []
     for index, row in enumerate(table.rows):
-        if row.overrides is None:
-            continue
         try:
             wanted = composer.identity(row.overrides, benchmark.seeds[0])
         except UnknownOptionError as error:

@@ -152,8 +152,8 @@ def caption(filled: Filled) -> str:
             f"Scenes are those of {filled.benchmark.name}, not the paper's ({filled.table.dataset}), whose averages stand "
             f"beside ours for the order of rows only."
         )
-    if any(row.overrides is None for row in filled.table.rows):
-        parts.append(f"{MISSING}: method not built, or no run.")
+    if not all(math.isfinite(cell.mean) for cell in filled.cells.values()):
+        parts.append(f"{MISSING}: no run, or a score that a method does not have.")
     return " ".join(parts)
 
 

@@ -44,7 +44,7 @@ _TABLE_KEYS = {
     "categories",
     "rows",
 }
-_ROW_KEYS = {"label", "set", "method", "group", "marks", "paper", "ours"}
+_ROW_KEYS = {"label", "set", "group", "marks", "paper", "ours"}
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -53,10 +53,8 @@ class Row:
     """One line of a table."""
 
     label: str
-    overrides: tuple[str, ...] | None
-    """Hydra overrides that make the run; None where the method is not built."""
-    method: str = ""
-    """Name of a method that is not built yet."""
+    overrides: tuple[str, ...]
+    """Hydra overrides that make the run."""
     group: str = ""
     """Part of the table that the row belongs to."""
     marks: Mapping[str, bool] = field(default_factory=lambda: _EMPTY)
@@ -89,11 +87,6 @@ class Table:
     """Category -> ``translucent_reflective`` or ``other``."""
     source: str = "sweeps"
     """File that it was read from, for errors."""
-
-    @property
-    def runnable(self) -> tuple[Row, ...]:
-        """Rows whose method is built."""
-        return tuple(row for row in self.rows if row.overrides is not None)
 
 
 def is_label(text: str) -> bool:
@@ -180,10 +173,8 @@ def load_table(path: Path) -> Table:
 
 
 def _row(where: str, content: Any, metrics: tuple[str, ...], columns: set[str]) -> Row:
-    _require_keys(where, content, _ROW_KEYS, {"label"})
-    if ("set" in content) == ("method" in content):
-        raise ValueError(f"{where}: must have either set or method, got keys {sorted(content)}")
-    overrides = _require(where, content, "set", list, str) if "set" in content else None
+    _require_keys(where, content, _ROW_KEYS, {"label", "set"})
+    overrides = _require(where, content, "set", list, str)
     paper: dict[str, dict[str, float]] = {}
     for column, value in _require(where, content, "paper", dict).items():
         if column not in columns:
@@ -201,8 +192,7 @@ def _row(where: str, content: Any, metrics: tuple[str, ...], columns: set[str]) 
         raise ValueError(f"{where}: label must be a text, got {briefly(label)}")
     return Row(
         label=str(label),
-        overrides=None if overrides is None else tuple(overrides),
-        method=_require(where, content, "method", str),
+        overrides=tuple(overrides),
         group=_require(where, content, "group", str),
         marks=_require(where, content, "marks", dict, bool),
         paper=paper,
