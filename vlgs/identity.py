@@ -67,7 +67,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes": "none",
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
-    "gaussians.densify.strays": False,
+    "gaussians.clear_air": False,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "stages": None,
     "trainer.exposure": False,

@@ -48,16 +48,16 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors": ("f6f83e32f15b45b4", "99d8cde4f4803be1", "bca9eee803a5ac58"),
+    "data.scene=mirrors": ("74db44fdd708523a", "6ad04c7204eb394f", "c332f65e94b1c03d"),
     "levels=joint indicator=per_level fusion=none trainer=paper": (
-        "17c0ba2aa7441e2a",
-        "7c33df2765de0765",
-        "bca9eee803a5ac58",
+        "295b8e6568c9e5c9",
+        "bd3320272238caed",
+        "c332f65e94b1c03d",
     ),
     "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2": (
-        "cbf2231b856ab97f",
-        "11f318e48e5049a8",
-        "7fa5eb265910cece",
+        "681f0145d14df312",
+        "224d518c7a8831c1",
+        "d3ca131acb55689c",
     ),
 }
 """Overrides -> run id for a content called f, recipe, data recipe. Where numbers change too, `RESULTS_VERSION` is raised and these are

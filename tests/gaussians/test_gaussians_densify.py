@@ -118,16 +118,6 @@ def test_pruned_rows_take_their_moments_with_them():
     torch.testing.assert_close(moments, 0.1 * torch.tensor([1.0, 2, 3, *range(5, 21)]))
 
 
-def test_strays_go_whatever_their_weight_and_gradient():
-    params = make(20)
-    strays, state = torch.arange(20) == 7, state_of([HOT] * 20)
-    report = densify(
-        params, adam(params), state, GaussiansConfig(), EXTENT, 0, EARLY, strays=strays
-    )
-    assert report == DensifyReport(cloned=19, split=0, pruned=1, count=38)
-    assert not (params["means"] == make(20)["means"][7]).all(dim=1).any()
-
-
 def test_removed_rows_take_their_moments_with_them_and_some_are_left():
     params, before = make(20), make(20)
     optimizer, state = adam(params), state_of([HOT] * 20)

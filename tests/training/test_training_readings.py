@@ -114,7 +114,7 @@ def test_codes_and_indicators_slow_down_along_half_a_cosine(tiny_scene: Scene):
 
 
 def test_air_is_cleared_in_the_end_of_what_colour_cannot_see(tiny_scene: Scene):
-    module = module_of(tiny_scene, "gaussians.densify.strays=true")
+    module = module_of(tiny_scene, "gaussians.clear_air=true")
     camera, splats = tiny_scene.train[0].camera, module.model.splats
     axis = camera.viewmat[:3, :3].T @ torch.tensor([0.0, 0.0, 0.05])
     with torch.no_grad():
@@ -168,8 +168,8 @@ def test_pairs_of_neighbours(tiny_scene: Scene):
     [
         ("gaussians.color=hsv", "color must be one of rgb_dc, rgb, evaluated, got 'hsv'"),
         (
-            "gaussians.init_features=random",
-            "init_features must be one of zero, lifted, normal, got 'random'",
+            "gaussians.init_features=zeros",
+            "init_features must be one of zero, lifted, normal, random, got 'zeros'",
         ),
         ("blend.kept=second", "kept must be one of first, nearer, got 'second'"),
         ("blend.pairs=near", "pairs must be one of uniform, neighbours, got 'near'"),

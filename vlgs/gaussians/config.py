@@ -30,9 +30,6 @@ class DensifyConfig:
     """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
     prune_below: float = 0.005
     """Weight under which a Gaussian is removed; see `GaussiansConfig.prune_on`."""
-    strays: bool = False
-    """Whether Gaussians that no training view has the centre of, or that only language sees before a camera, are removed
-    (`vlgs.gaussians.strays`)."""
     prune_large: bool = True
     """Whether Gaussians above `max_scale_share` are removed, once the first opacity reset has passed."""
     max_scale_share: float = 0.1
@@ -120,6 +117,8 @@ class GaussiansConfig:
     silent_above: float = 0.7
     """Share of a Gaussian's language weight outside of masks, over the training views, above which its code is zero in the end
     (`vlgs.training.silence`); 1: none is."""
+    clear_air: bool = False
+    """Whether Gaussians that only language sees, before a camera, are removed in the end (`vlgs.gaussians.in_air`)."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""

@@ -109,7 +109,6 @@ def densify(
     step: int,
     centers: Float[Tensor, "v 3"] | None = None,
     attributes: Attributes = STANDARD,
-    strays: Bool[Tensor, " n"] | None = None,
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
@@ -127,7 +126,6 @@ def densify(
         step: Of the run; large Gaussians are spared until the first opacity reset has passed.
         centers: Of the training cameras; what is `BACKGROUND` away from all of them may be large. None: nothing may.
         attributes: The table of `params`.
-        strays: Gaussians to remove whatever their weight (`vlgs.gaussians.strays`). None: there are none.
 
     Raises:
         ValueError: If `state` has another size than `params`, or no Gaussian is finite.
@@ -136,7 +134,7 @@ def densify(
     if state.grad_sum.shape[0] != n:
         raise ValueError(f"densify: state must have {n} rows, got {state.grad_sum.shape[0]}")
     with torch.no_grad():
-        dead = _dead(params, config, attributes, strays)
+        dead = _dead(params, config, attributes)
         grow = _hot(state, config) & ~dead
         grow = _highest(grow, state.mean(), config.max_count - int((~dead).sum()))
         small = _largest_scale(params, attributes) <= config.densify.dense_share * extent
@@ -188,12 +186,9 @@ def remove(
 
 
 def _dead(
-    params: nn.ParameterDict,
-    config: GaussiansConfig,
-    attributes: Attributes,
-    strays: Bool[Tensor, " n"] | None,
+    params: nn.ParameterDict, config: GaussiansConfig, attributes: Attributes
 ) -> Bool[Tensor, " n"]:
-    """Gaussians that are too faint to matter or stray, and those with broken parameters."""
+    """Gaussians that are too faint to matter, and those with broken parameters."""
     indicator, opacity = params["indicator_logits"].sigmoid(), params["opacity_logits"].sigmoid()
     if indicator.dim() == 2:  # one level that needs a Gaussian keeps it
         indicator = indicator.amax(dim=1)
@@ -210,10 +205,7 @@ def _dead(
         raise ValueError("densify: Gaussians must be finite, got none that is")
     if not finite.all():
         log.warning("densify: %d of %d Gaussians are not finite", int((~finite).sum()), len(finite))
-    doomed = weight < config.densify.prune_below
-    if strays is not None:
-        doomed |= strays
-    return _spare(doomed, weight, finite) | ~finite
+    return _spare(weight < config.densify.prune_below, weight, finite) | ~finite
 
 
 def _spare(

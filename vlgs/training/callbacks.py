@@ -15,6 +15,7 @@ import lightning as L
 
 from vlgs.files import write_atomically
 from vlgs.gaussians import densify, remove, reset_opacity
+from vlgs.gaussians.in_air import Air
 from vlgs.runs import RunFolder, stop_signals
 from vlgs.training.after_step import AfterStep, TrainedModule, own
 from vlgs.training.checkpoint import save_checkpoint
@@ -52,26 +53,25 @@ class Densification(AfterStep):
                 done,
                 densifying.centers,
                 module.model.attributes,
-                module.strays(),
             )
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)
 
 
 class ClearAir(AfterStep):
-    """After the last iteration, remove what only language sees before a camera (`vlgs.gaussians.strays`).
-
-    Colour loses nothing. Gaussians out of view stay, as the margins of views would lose them with nothing to take their place.
-    """
+    """After the last iteration, remove what only language sees before a camera (`vlgs.gaussians.in_air`). Colour stays as it is."""
 
     def after_step(self, module: TrainedModule) -> None:
         """Do so when it is time, where positions were trained and Gaussians could come and go."""
         assert isinstance(module, VLGSModule)
         densifying, splats = module.densifying, module.model.splats
         done = module.next_step == module.settings.iterations
-        if not done or densifying.strays is None or densifying.config.densify.stop == 0:
+        if not done or not densifying.config.clear_air or densifying.config.densify.stop == 0:
             return
-        gone = densifying.strays.in_air(splats["means"], module.faint())
+        opacities = splats["opacity_logits"].detach().sigmoid()
+        gone = Air(module.views.scene)(splats["means"]) & (
+            opacities < module.model.raster.alpha_min
+        )
         remove(splats, module.optimizer, densifying.state, gone)
 
 

@@ -7,13 +7,12 @@ from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.gaussians.ply import SH_COEFFICIENTS
-from vlgs.gaussians.strays import Strays
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
@@ -35,8 +34,6 @@ class Densifying:
     """`vlgs.geometry.scene_extent` of the training cameras."""
     centers: Float[Tensor, "v 3"]
     """Of the training cameras."""
-    strays: Strays | None
-    """Finds Gaussians to remove; None: none is looked for."""
 
 
 class VLGSModule(L.LightningModule):
@@ -78,7 +75,6 @@ class VLGSModule(L.LightningModule):
             DensifyState.zeros(model.count),
             scene_extent(viewmats),
             camera_center(viewmats).float(),
-            Strays(views.scene) if config.densify.strays else None,
         )
         color = any("color" in objective.needs for objective in setup.objectives.values())
         keeps = settings.skip.frozen_weights and not model.evaluated
@@ -137,16 +133,6 @@ class VLGSModule(L.LightningModule):
             done.seen.log,
             tuple(target.image for target in done.seen.targets),
         )
-
-    def faint(self) -> Bool[Tensor, " n"]:
-        """Gaussians that colour cannot see: no opacity above the contribution from which on they are drawn."""
-        opacities = self.model.splats["opacity_logits"].detach().sigmoid()
-        return opacities < self.model.raster.alpha_min
-
-    def strays(self) -> Bool[Tensor, " n"] | None:
-        """Gaussians to remove, or None where none is looked for."""
-        find = self.densifying.strays
-        return None if find is None else find(self.model.splats["means"], self.faint())
 
     def _make_optimizer(self) -> torch.optim.Adam:
         groups = [

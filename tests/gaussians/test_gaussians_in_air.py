@@ -1,0 +1,57 @@
+"""What counts as the air before a camera."""
+
+import math
+
+import pytest
+import torch
+
+from vlgs.gaussians.in_air import Air
+from vlgs.types import Camera, Scene, View
+
+NEAREST = 2.0
+"""Distance of the nearest sparse point that the first camera sees."""
+
+
+def camera(turn: float, x: float) -> Camera:
+    """At (x, 0, 0); without a turn it looks along z, 45 degrees to either side."""
+    c, s = math.cos(turn), math.sin(turn)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.tensor([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([x, 0.0, 0.0])
+    return Camera(
+        viewmat, torch.tensor([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), 16, 16
+    )
+
+
+def air(points: list[list[float]]) -> Air:
+    """Two cameras back to back: one unit apart, and no point before the second."""
+    views = tuple(
+        View(name, camera(turn, x), lambda: torch.zeros(16, 16, 3, dtype=torch.uint8))
+        for name, turn, x in (("front", 0.0, 0.0), ("back", math.pi, 1.0))
+    )
+    given = torch.tensor(points)
+    colors = torch.zeros(given.shape, dtype=torch.uint8)
+    none = torch.zeros(0, 8), torch.zeros(0)
+    return Air(Scene("toy", views, (), "all", given, colors, *none))
+
+
+POINTS = [[0.0, 0.0, NEAREST], [1.0, 0.0, 3.0], [9.0, 0.0, 0.5], [math.nan, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("mean", "inside"),
+    [
+        ((0.0, 0.0, 1.9), True),  # before the first camera
+        ((0.0, 0.0, 2.1), False),  # behind its nearest point
+        ((1.5, 0.0, 1.6), False),  # farther from it than that, though less deep
+        ((1.0, 0.0, -0.5), False),  # before the second, of which no point says anything
+        ((2.2, 0.0, 0.1), False),  # between the two: no image has it
+    ],
+)
+def test_what_is_in_the_air(mean: tuple[float, float, float], inside: bool):
+    assert air(POINTS)(torch.tensor([mean])).tolist() == [inside]
+
+
+def test_nothing_is_in_the_air_without_points():
+    means = torch.tensor([[0.0, 0.0, 0.1], [0.3, 0.0, 5.0]])
+    assert not air([[math.nan] * 3])(means).any()
