@@ -29,6 +29,7 @@ SLOW = {
     "python -m vlgs.check data=colmap data.root=SCENE": (),
     "python -m vlgs.run": SMOKE,
     "python -m vlgs.run fusion=none indicator=opacity blend=none": SMOKE,
+    "python -m vlgs.run method=langsplat fusion=self": SMOKE,
     "python -m vlgs.run -m fusion=none,mlp,cross,self seed=0,1,2": SMOKE,
     "python -m vlgs.run data=colmap data.root=SCENE data.resize=0.5 trainer=photos": (
         *("data.resize=1", "trainer.iterations=10", "pictures=false", "progress=false"),

@@ -36,6 +36,7 @@ from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.heads.autoencoder import Autoencoder
+from vlgs.heads.classifier import Classifier
 from vlgs.heads.codebook import Codebook
 from vlgs.heads.identity import Identity
 from vlgs.heads.linear import Linear
@@ -53,6 +54,7 @@ from vlgs.losses import (
 )
 from vlgs.objectives import CodebookLanguage, CodeClasses, Language, LookupLanguage
 from vlgs.objectives.lookup import choice_error
+from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
@@ -77,12 +79,16 @@ NO_GRADIENT = {
         "objective.Objective.__call__", "photometric.Photometric.__call__", "language.Language.__call__",
         "blended_view.BlendedView.__call__", "blended_view.BlendedView.loss", "code_classes.CodeClasses.__call__",
         "codebook.CodebookLanguage.__call__", "lookup.LookupLanguage.__call__", "smooth_codes.SmoothCodes.__call__",
+        "mask_classes.MaskClasses.__call__", "mask_classes.NeighbourClasses.__call__",
     )},
     "vlgs.objectives.smooth_codes.SmoothCodes.terms": "each term leaves one side where it is (tests/objectives)",
+    "vlgs.objectives.mask_classes.NeighbourClasses.draw": "picks rows",
     "vlgs.objectives.targets.masked_codes": "picks pixels",
     "vlgs.objectives.targets.TrainingViews.codes_of": "picks rows of what is not trained",
     "vlgs.objectives.targets.covered": "a mask",
     "vlgs.gaussians.attributes.Attribute.first": "before training",
+    "vlgs.gaussians.in_air.Air.__call__": "a mask",
+    "vlgs.gaussians.init.in_view": "a mask",
     "vlgs.gaussians.parameters.at_levels": "before training",
     "vlgs.heads.clusters.clusters": "before training",
     "vlgs.heads.lookup.LookupTable.decode": "picks rows, after training",
@@ -262,7 +268,7 @@ def linear_head(name: str) -> Check:
     del made.map  # its weights are inputs here
 
     def run(x: Tensor, weight: Tensor, bias: Tensor):
-        made.__dict__["map"] = partial(torch.nn.functional.linear, weight=weight, bias=bias)
+        made.__dict__["map"] = SimpleNamespace(weight=weight, bias=bias)
         return getattr(made, name)(x)
 
     return run, [draw(2, 3, 3), draw(4, 3, seed=1), draw(4, seed=2)]
@@ -294,6 +300,12 @@ def head() -> Autoencoder:
     torch.manual_seed(0)
     made.build(5)
     made.requires_grad_(False)
+    return made.double()
+
+
+def classifier() -> Classifier:
+    made = Classifier(dim=2)
+    made.fit(draw(3, 4).float(), torch.ones(3))
     return made.double()
 
 
@@ -445,6 +457,16 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.heads.quantised.quantiser_loss": lambda: (
         lambda a, b: quantiser_loss([a, b], [1.0, 0.5], 2.0), [draw(6, 3), draw(6, 3, seed=1)]
     ),
+    "vlgs.heads.classifier.Classifier.logits": lambda: (classifier().logits, [draw(4, 2)]),
+    "vlgs.heads.classifier.Classifier.targets": lambda: (classifier().targets, [draw(4, 4)]),
+    "vlgs.heads.classifier.Classifier.predict": lambda: (classifier().predict, [draw(4, 2)]),
+    "vlgs.heads.classifier.Classifier.decode": lambda: (classifier().decode, [draw(4, 2)]),
+    "vlgs.objectives.mask_classes.MaskClasses.of": lambda: (
+        lambda codes: bound(MaskClasses(), classifier()).of(codes, torch.tensor([0, -1, 2, 1])), [draw(4, 2)]
+    ),
+    "vlgs.objectives.mask_classes.NeighbourClasses.of": lambda: (
+        bound(NeighbourClasses(), classifier()).of, [draw(3, 1, 2), draw(3, 5, 1, 2, seed=1)]
+    ),
     "vlgs.objectives.codebook.CodebookLanguage.total": lambda: codebook("total"),
     "vlgs.objectives.lookup.LookupLanguage.terms": lambda: (
         lambda codes: tuple(bound(LookupLanguage(), lookup()).terms(codes, torch.tensor([0, 3, 0, 1]), 2.0).values()),
@@ -560,7 +582,7 @@ def public_functions(package: str) -> set[str]:
                 returns = str(getattr(function, "__annotations__", {}).get("return", ""))
                 if inspect.isfunction(function) and any(
                     kind in returns
-                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "StressScene")
+                    for kind in ("Float[", "Tensor", "Gaussians", "Render", "Splats")
                 ):
                     found.add(f"{module}.{name}.{member}".rstrip("."))
     return found

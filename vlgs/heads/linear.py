@@ -58,4 +58,4 @@ class Linear(nn.Module):
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; `predict` at unit length."""
-        return normalize(self.map(codes), dim=-1, eps=1e-6)
+        return normalize(self.predict(codes), dim=-1, eps=1e-6)
