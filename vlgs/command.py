@@ -199,7 +199,10 @@ def _compose(overrides: Sequence[str], name: str, extra: Path | None, hydra: boo
 def _explain(overrides: Sequence[Override], name: str, extra: Path | None) -> None:
     """Raise our own error for the first key that does not exist."""
     chosen = tuple(str(o.input_line) for o in overrides if _options(o.key_or_group, extra))
-    known = _keys(name, chosen)
+    try:
+        known = _keys(name, chosen)
+    except HydraException:
+        return  # an option of a group that nothing brings, such as lift without method=lift: Hydra says so
     for override in overrides:
         key = override.key_or_group
         if override.input_line in chosen or key.startswith("hydra"):

@@ -96,6 +96,7 @@ def test_a_method_runs(chosen, tmp_path: Path):
         (["method=lifted", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
         (["method=gs3d", "fusion=self"], "fusion must be none with a method of colour alone, as there is no language, got self"),
         (["method=gs3d", "indicator=learned"], "indicator must be fixed or opacity with a method of colour alone"),
+        (["method=goi", "head=autoencoder"], "head must be lookup with loss.lookup, as it learns the rows of a table, got autoencoder"),
         (["stages=[3]"], "config: stages must be a list of stages, got"),
         (["stages=[{_target_: vlgs.training.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
         (["stages=[{_target_: vlgs.training.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),

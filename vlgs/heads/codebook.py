@@ -1,5 +1,7 @@
 """LangSplatV2's head: a rendered code says how much of each entry of a codebook a pixel shows (Li et al., NeurIPS 2025)."""
 
+from typing import ClassVar
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -32,6 +34,9 @@ class Codebook(nn.Module):
         >>> head.predict(torch.tensor([[1.0, 0.0, 0.0, 0.0]])).shape
         torch.Size([1, 8])
     """
+
+    has_entries: ClassVar[bool] = True
+    """What its loss asks of it (`vlgs.demands`)."""
 
     def __init__(
         self, dim: int = 64, width: int = 512, learning_rate: float = 2.5e-3, seed: int = 0

@@ -1,6 +1,7 @@
 """GOI's head: a rendered code is classified, and its class is a row of a table of embeddings (Qu et al., ACM MM 2024)."""
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -36,6 +37,9 @@ class LookupTable(nn.Module):
         >>> head.predict(torch.zeros(5, 2)).shape, head.decode(torch.zeros(5, 2)).shape
         (torch.Size([5, 4]), torch.Size([5, 8]))
     """
+
+    has_table: ClassVar[bool] = True
+    """What its loss asks of it (`vlgs.demands`)."""
 
     def __init__(
         self,

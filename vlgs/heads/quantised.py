@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -63,6 +64,8 @@ class QuantisedCodes(nn.Module):
         tensor([1., 1., 1., 1., 1., 1., 1., 1.])
     """
 
+    has_classes: ClassVar[bool] = True
+    """What its loss asks of it (`vlgs.demands`)."""
     codebook: Tensor
 
     def __init__(

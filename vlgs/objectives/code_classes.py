@@ -1,9 +1,13 @@
 """Language by classes of codes that may be doubted: the semantic terms of LEGaussians (Shi et al., CVPR 2024)."""
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from vlgs.demands import Demand
 from vlgs.heads.quantised import QuantisedCodes
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import masked_codes
@@ -25,6 +29,10 @@ class CodeClasses(Objective):
     Raises:
         ValueError: If the weight is negative.
     """
+
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand("loss.classes", "head", "has_classes", "as it looks at the classes of codes"),
+    )
 
     def __init__(self, price: float = 1.0, attribute: str = "uncertainty") -> None:
         require_range("code classes", 0, 1e6, price=price)

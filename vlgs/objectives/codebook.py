@@ -1,8 +1,12 @@
 """Language by weights of a codebook: LangSplatV2's 1 - cos, without a map of embeddings (Li et al., NeurIPS 2025)."""
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from vlgs.demands import Demand
 from vlgs.heads.codebook import Codebook
 from vlgs.heads.rows import linear_rows
 from vlgs.losses import RENDER_FLOOR, TARGET_FLOOR
@@ -26,6 +30,9 @@ class CodebookLanguage(Objective):
         ValueError: If there are no such pixels.
     """
 
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand("loss.codebook", "head", "has_entries", "as it learns the entries of a codebook"),
+    )
     needs = frozenset({"feature"})
 
     def __init__(self, pixels: Pixels = "valid") -> None:

@@ -1,11 +1,15 @@
 """Language by a table of embeddings: the four terms of GOI (Qu et al., ACM MM 2024)."""
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
+from vlgs.demands import Demand
 from vlgs.heads.lookup import LookupTable
 from vlgs.heads.rows import linear_rows
 from vlgs.objectives.objective import Objective, Setup, StepView
@@ -41,6 +45,9 @@ class LookupLanguage(Objective):
         ValueError: If a weight is negative, or `late` is not in [0, 1].
     """
 
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand("loss.lookup", "head", "has_table", "as it learns the rows of a table"),
+    )
     needs = frozenset({"feature"})
 
     def __init__(
