@@ -86,6 +86,7 @@ NO_GRADIENT = {
     "vlgs.objectives.targets.masked_codes": "picks pixels",
     "vlgs.objectives.targets.TrainingViews.codes_of": "picks rows of what is not trained",
     "vlgs.objectives.targets.covered": "a mask",
+    "vlgs.objectives.objective.StepView.with_language": "goes through what is checked",
     "vlgs.gaussians.attributes.Attribute.first": "before training",
     "vlgs.gaussians.in_air.Air.__call__": "a mask",
     "vlgs.gaussians.init.in_view": "a mask",
@@ -131,7 +132,7 @@ NO_GRADIENT = {
     **{f"vlgs.fields.{name}": "training is over" for name in (
         "nerf.NerfField.similarity", "hash_splat.HashSplatField.similarity", "hash_splat.HashSplatField.opacities",
         "hash_splat.HashSplatField.language_weights", "hash_splat.HashSplatField.gaussian_similarity",
-        "hash_splat.HashSplatField.render_values",
+        "hash_splat.HashSplatField.render_values", "similarity.rendered_feature",
     )},
     **{f"vlgs.fields.{name}": "places, which nothing moves" for name in (
         "hash_grid.HashGrid.corners", "rays.Spacing.__call__", "rays.importance", "rays.nearest_seen", "radiance.nearest_of",

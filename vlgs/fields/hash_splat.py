@@ -10,7 +10,7 @@ from torch import Tensor
 from vlgs.fields import Field, FieldImages, PointCloud, require_outputs
 from vlgs.fields.language_field import LanguageField
 from vlgs.fields.radiance import Frame, in_cube
-from vlgs.fields.similarity import CHUNK, cosines
+from vlgs.fields.similarity import CHUNK, cosines, rendered_feature
 from vlgs.fields.trained import SplatField
 from vlgs.types import Camera
 
@@ -56,13 +56,7 @@ class HashSplatField:
         pixels: Int[Tensor, " p"] | None = None,
     ) -> Float[Tensor, "levels k h w"]:
         """See `Field`."""
-        if seen is None or seen.feature is None:
-            seen = self.render(camera, frozenset({"feature"}))
-        assert seen.feature is not None  # it was asked for
-        feature = seen.feature
-        if pixels is not None:
-            feature = feature.flatten(1, 2)[:, None, pixels]
-        return cosines(feature[0], words)[None]
+        return cosines(rendered_feature(self, camera, seen, pixels)[0], words)[None]
 
     def opacities(self) -> Float[Tensor, " n"]:
         """See `HasGaussians`."""

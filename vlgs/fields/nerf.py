@@ -9,7 +9,7 @@ from torch import Tensor
 from vlgs.fields import Field, FieldImages, require_outputs
 from vlgs.fields.language_field import LanguageField
 from vlgs.fields.radiance import RadianceField, Samples
-from vlgs.fields.similarity import CHUNK, cosines
+from vlgs.fields.similarity import CHUNK, cosines, rendered_feature
 from vlgs.types import Camera
 
 RAYS = 2048
@@ -85,12 +85,7 @@ class NerfField:
         pixels: Int[Tensor, " p"] | None = None,
     ) -> Float[Tensor, "levels k h w"]:
         """See `Field`: at each word's best scale, which is one for all pixels that are asked."""
-        if seen is None or seen.feature is None:
-            seen = self.render(camera, frozenset({"feature"}))
-        assert seen.feature is not None  # it was asked for
-        features = seen.feature[0]
-        if pixels is not None:
-            features = features.flatten(0, 1)[None, pixels]
+        features = rendered_feature(self, camera, seen, pixels)[0]
         flat = features.flatten(0, 1)
         best = self._ask(flat, words, self.scales[0])
         for scale in self.scales[1:]:

@@ -3,14 +3,33 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from vlgs.fields import Field, FieldImages
+from vlgs.types import Camera
 
 SMALLEST_NORM = 1e-6
 """Vectors shorter than this count as having no direction: their cosines fade to 0 instead of being 0/0."""
 
 CHUNK = 4096
 """Pixels that are decoded at once: 8 MB of 512-d float32 features, which stay in cache, whatever the size of the view."""
+
+
+def rendered_feature(
+    field: Field,
+    camera: Camera,
+    seen: FieldImages | None,
+    pixels: Int[Tensor, " p"] | None,
+) -> Float[Tensor, "levels h w d"]:
+    """What a field knows of language from a camera: taken from `seen` if that has it, and of the pixels that are asked, as an image of one row.
+
+    Arguments are those of `Field.similarity`.
+    """
+    if seen is None or seen.feature is None:
+        seen = field.render(camera, frozenset({"feature"}))
+    assert seen.feature is not None  # it was asked for
+    return seen.feature if pixels is None else seen.feature.flatten(1, 2)[:, None, pixels]
 
 
 def cosines(features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"]) -> Float[Tensor, " k *p"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vlgs.fields import Field, FieldImages, PointCloud, require_outputs
 from vlgs.fields.cloud import point_cloud
-from vlgs.fields.similarity import decoded_cosines
+from vlgs.fields.similarity import decoded_cosines, rendered_feature
 from vlgs.fields.splat import FusedGaussians, SplatModel
 from vlgs.types import Camera
 
@@ -73,13 +73,7 @@ class SplatField:
         pixels: Int[Tensor, " p"] | None = None,
     ) -> Float[Tensor, "levels k h w"]:
         """See `Field`: cosines with the decoded codes."""
-        if seen is None or seen.feature is None:
-            seen = self.render(camera, frozenset({"feature"}))
-        assert seen.feature is not None  # it was asked for
-        codes = seen.feature
-        if pixels is not None:
-            codes = codes.flatten(1, 2)[:, None, pixels]
-        return self._compare(codes, words)
+        return self._compare(rendered_feature(self, camera, seen, pixels), words)
 
     def opacities(self) -> Float[Tensor, " n"]:
         """See `HasGaussians`."""

@@ -57,10 +57,8 @@ class CodeClasses(Objective):
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """Both terms of each view that has language."""
         terms: dict[str, Tensor] = {}
-        for place, render, target in zip("12", step.renders, step.targets, strict=True):
-            if render.feature is None or not target.has_language:
-                continue
-            codes, masks = masked_codes(render.feature, target)
+        for place, render, feature, target in step.with_language():
+            codes, masks = masked_codes(feature, target)
             if len(masks):
                 doubt = _of_valid(render.further[self.attribute], target.valid)
                 error, price = self.terms(codes, self.views.codes_of(masks), doubt)

@@ -55,10 +55,8 @@ class CodebookLanguage(Objective):
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """One term for each view that has language."""
         terms: dict[str, Tensor] = {}
-        for place, render, target in zip("12", step.renders, step.targets, strict=True):
-            if render.feature is None or not target.has_language:
-                continue
-            codes, masks = masked_codes(render.feature, target)
+        for place, _, feature, target in step.with_language():
+            codes, masks = masked_codes(feature, target)
             if len(masks):
                 count = target.masks.numel() if self.pixels == "all" else len(masks)
                 terms[f"language {place}"] = self.total(codes, masks) / count

@@ -47,10 +47,9 @@ class Language(Objective):
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """One for each view that has language."""
         terms: dict[str, Tensor] = {}
-        for place, render, target in zip("12", step.renders, step.targets, strict=True):
-            if render.feature is not None and target.has_language:
-                error = self._of_masked if self.views is not None else self._of_map
-                terms[f"language {place}"] = error(render.feature, target)
+        error = self._of_masked if self.views is not None else self._of_map
+        for place, _, feature, target in step.with_language():
+            terms[f"language {place}"] = error(feature, target)
         return terms
 
     def of(

@@ -86,10 +86,8 @@ class LookupLanguage(Objective):
         late = step.step >= self.late * self.iterations
         temperature = self.late_temperature if late else self.temperature
         terms: dict[str, Tensor] = {}
-        for place, render, target in zip("12", step.renders, step.targets, strict=True):
-            if render.feature is None or not target.has_language:
-                continue
-            codes, masks = masked_codes(render.feature, target)
+        for place, _, feature, target in step.with_language():
+            codes, masks = masked_codes(feature, target)
             if len(masks):
                 own = self.terms(codes, masks, temperature)
                 terms |= {f"{name} {place}": term for name, term in own.items()}

@@ -48,11 +48,9 @@ class MaskClasses(Objective):
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """One for each view that has masks."""
         terms: dict[str, Tensor] = {}
-        for place, render, target in zip("12", step.renders, step.targets, strict=True):
-            if render.feature is not None and target.has_language:
-                masks = target.masks
-                codes = render.feature.view(*masks.shape, -1)
-                terms[f"classes {place}"] = self.of(codes, masks)
+        for place, _, feature, target in step.with_language():
+            codes = feature.view(*target.masks.shape, -1)
+            terms[f"classes {place}"] = self.of(codes, target.masks)
         return terms
 
     def of(self, codes: Float[Tensor, "*b d"], masks: Int[Tensor, "*b"]) -> Float[Tensor, ""]:

@@ -1,7 +1,7 @@
 """The interface of an objective, and what it sees of an iteration."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
@@ -49,6 +49,12 @@ class StepView:
     """Render the Gaussians of this iteration from another camera; arguments as those of `SplatModel.render`."""
     log: dict[str, float] = field(default_factory=dict)
     """Numbers for callbacks, filled by the objectives."""
+
+    def with_language(self) -> Iterator[tuple[str, ViewRender, Float[Tensor, "h w c"], Target]]:
+        """Of the real views those with codes to learn from: their place, 1 or 2, their render, the codes of it, and their target."""
+        for place, render, target in zip("12", self.renders, self.targets, strict=True):
+            if render.feature is not None and target.has_language:
+                yield place, render, render.feature, target
 
 
 class Objective(ABC):

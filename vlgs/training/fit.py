@@ -2,15 +2,17 @@
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import lightning as L
 from lightning.pytorch.loggers import Logger
 
 from vlgs.runs import RunFolder
+from vlgs.training.after_step import TrainedModule
 from vlgs.training.callbacks import (
     Checkpoints,
     ClearAir,
@@ -22,8 +24,7 @@ from vlgs.training.callbacks import (
     Silence,
     TrainingClock,
 )
-from vlgs.training.checkpoint import keep_from, load_checkpoint
-from vlgs.training.learner import Learner
+from vlgs.training.checkpoint import Checkpoint, keep_from, load_checkpoint
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.state import restore
 from vlgs.training.zero_gradients import StuckAlarm
@@ -44,10 +45,10 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
-class Steps:
+class _Steps:
     """The iterations that remain, as Lightning wants its batches."""
 
-    module: VLGSModule | Learner
+    module: TrainedModule
 
     def __iter__(self) -> Iterator[int]:
         return iter(range(self.module.next_step, self.module.settings.iterations))
@@ -57,7 +58,26 @@ class Steps:
 
 
 def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | None:
+    """Train Gaussians to the end of their budget; see `train_on`."""
+    changes = [StuckAlarm(module.settings.log_every), Densification(), ClearAir(), Silence()]
+    return train_on(module, partial(restore, module), changes, folder, options)
+
+
+def train_on(
+    module: TrainedModule,
+    restore: Callable[[Checkpoint], None],
+    changes: Sequence[L.Callback],
+    folder: RunFolder,
+    options: FitOptions,
+) -> str | None:
     """Train what remains.
+
+    Args:
+        module: New.
+        restore: Puts a checkpoint back into it.
+        changes: What belongs to an iteration besides its step.
+        folder: Where checkpoints lie, or will.
+        options: What moves no number.
 
     Returns:
         None when the budget is done, else the name of the signal that stopped it; either way the last whole step is saved.
@@ -69,36 +89,31 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     folder.require_own()
     checkpoint = load_checkpoint(folder.checkpoint)
     if checkpoint is not None:
-        restore(module, checkpoint)
+        restore(checkpoint)
         keep_from(folder.checkpoint, checkpoint.step)
         log.info("resuming %s at step %d", folder.path, module.next_step)
-    steps = Steps(module)
+    steps = _Steps(module)
     if len(steps) == 0:
         return None
     folder.path.mkdir(parents=True, exist_ok=True)
-    stop = GracefulStop()
+    stop, settings = GracefulStop(), module.settings
     callbacks: list[L.Callback] = [
         OwnFolder(folder),  # before whatever writes
-        StuckAlarm(module.settings.log_every),
-        Densification(),
-        ClearAir(),
-        Silence(),
-        TrainingClock(),  # ends an iteration after its densification
-        CurveLog(folder.curves, module.settings.log_every),
-        Checkpoints(folder.checkpoint, module.settings.checkpoint_every, options.meta),
+        *changes,
+        TrainingClock(),  # ends an iteration after its changes
+        CurveLog(folder.curves, settings.log_every),
+        Checkpoints(folder.checkpoint, settings.checkpoint_every, options.meta),
         stop,
     ]
     if options.progress:
         callbacks.append(ProgressLine())
     callbacks += options.callbacks
-    with expected_warnings():
-        lightning_trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
+    with _expected_warnings():
+        _trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
     return stop.stopped_by
 
 
-def lightning_trainer(
-    folder: RunFolder, callbacks: list[L.Callback], options: FitOptions
-) -> L.Trainer:
+def _trainer(folder: RunFolder, callbacks: list[L.Callback], options: FitOptions) -> L.Trainer:
     """A Trainer with our own callbacks for checkpoints, curves and progress, and none of Lightning's."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -115,7 +130,7 @@ def lightning_trainer(
 
 
 @contextmanager
-def expected_warnings() -> Iterator[None]:
+def _expected_warnings() -> Iterator[None]:
     """Silence two warnings of Lightning that are expected here."""
     with warnings.catch_warnings():
         # The head is fitted before training starts; its BatchNorm must keep the statistics it has.

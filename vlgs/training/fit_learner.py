@@ -2,23 +2,12 @@
 
 import logging
 
-import lightning as L
-
 from vlgs.fields import Field
-from vlgs.runs import RunFolder
 from vlgs.skip_count import SkipCount
-from vlgs.training.callbacks import (
-    Checkpoints,
-    CurveLog,
-    GracefulStop,
-    OwnFolder,
-    ProgressLine,
-    TrainingClock,
-)
-from vlgs.training.checkpoint import checkpoint_bytes, keep_from, load_checkpoint
-from vlgs.training.fit import FitOptions, Steps, expected_warnings, lightning_trainer
+from vlgs.training.checkpoint import checkpoint_bytes
+from vlgs.training.fit import train_on
 from vlgs.training.learner import Learner
-from vlgs.training.workshop import Made, StoppedError, Workshop
+from vlgs.training.workshop import Made, Workshop, require_done
 
 log = logging.getLogger(__name__)
 
@@ -41,39 +30,8 @@ def train_learner(
     folder = workshop.folder.part(name)
     if name:
         log.info("model %s of this run, in %s", name, folder.path)
-    stopped_by = _fit(learner, folder, workshop.make_options())
-    if stopped_by is not None:
-        which = f" of {name}" if name else ""
-        where = f"step {learner.next_step} of {learner.settings.iterations}{which}"
-        raise StoppedError(stopped_by, where)
+    stopped_by = train_on(learner, learner.restore, (), folder, workshop.make_options())
+    require_done(learner, stopped_by, name)
     learner.model.requires_grad_(False)
     size = checkpoint_bytes(folder.checkpoint)
     workshop.made[name] = Made(folder, made, gaussians, learner.train_seconds, SkipCount(), size)
-
-
-def _fit(learner: Learner, folder: RunFolder, options: FitOptions) -> str | None:
-    """As `vlgs.training.fit.fit`."""
-    folder.require_own()
-    checkpoint = load_checkpoint(folder.checkpoint)
-    if checkpoint is not None:
-        learner.restore(checkpoint)
-        keep_from(folder.checkpoint, checkpoint.step)
-        log.info("resuming %s at step %d", folder.path, learner.next_step)
-    steps = Steps(learner)
-    if len(steps) == 0:
-        return None
-    folder.path.mkdir(parents=True, exist_ok=True)
-    stop, settings = GracefulStop(), learner.settings
-    callbacks: list[L.Callback] = [
-        OwnFolder(folder),  # before whatever writes
-        TrainingClock(),
-        CurveLog(folder.curves, settings.log_every),
-        Checkpoints(folder.checkpoint, settings.checkpoint_every, options.meta),
-        stop,
-    ]
-    if options.progress:
-        callbacks.append(ProgressLine())
-    callbacks += options.callbacks
-    with expected_warnings():
-        lightning_trainer(folder, callbacks, options).fit(learner, train_dataloaders=steps)
-    return stop.stopped_by

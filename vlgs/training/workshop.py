@@ -13,6 +13,7 @@ from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.runs import RunFolder
 from vlgs.skip_count import SkipCount
+from vlgs.training.after_step import TrainedModule
 from vlgs.training.build import Parts, build_module
 from vlgs.training.checkpoint import checkpoint_bytes, load_checkpoint, save_checkpoint
 from vlgs.training.fit import FitOptions, fit
@@ -30,6 +31,18 @@ class StoppedError(Exception):
 
     def __init__(self, signal: str, where: str) -> None:
         super().__init__(f"{signal}: stopped and saved at {where}")
+
+
+def require_done(module: TrainedModule, stopped_by: str | None, name: str) -> None:
+    """Do nothing if a model of this name was trained to the end.
+
+    Raises:
+        StoppedError: If it was asked to stop.
+    """
+    if stopped_by is not None:
+        which = f" of {name}" if name else ""
+        where = f"step {module.next_step} of {module.settings.iterations}{which}"
+        raise StoppedError(stopped_by, where)
 
 
 @dataclass(frozen=True)
@@ -103,10 +116,7 @@ class Workshop:
             log.info("model %s of this run, in %s", name, folder.path)
         module = self._build(scene, change(self.make_parts()), start, color)
         stopped_by = fit(module, folder, self.make_options())
-        if stopped_by is not None:
-            which = f" of {name}" if name else ""
-            where = f"step {module.next_step} of {module.settings.iterations}{which}"
-            raise StoppedError(stopped_by, where)
+        require_done(module, stopped_by, name)
         return self._remember(name, module, color or start is not None, kept)
 
     def lift(
