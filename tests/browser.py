@@ -52,7 +52,7 @@ def launched(graphics: bool = True, *flags: str) -> Iterator[Any]:
     """
     if find_spec("playwright") is None:
         pytest.skip("needs playwright: pip install 'vlgs[e2e]'")
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
 
     chosen = [*(_SOFTWARE if graphics else _NONE), *flags]
     sandbox = os.getuid() != 0  # Chromium's own refuses to run as root
