@@ -25,6 +25,7 @@ _HELP = """Formats, by suffix; --as says which where a suffix has several:
 
 Rows that are not finite or have no rotation are counted, and refuse the file; --drop leaves them out."""
 _COLMAP = ("colmap", "colmap-text")
+_COMPRESSED = FORMATS["compressed-ply"][0]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -104,15 +105,13 @@ def _point_cloud_of(folder: Path) -> tuple[Path, list[str]]:
 
 
 def _convert_gaussians(source: Path, target: Path, name: str | None, drop: bool) -> list[str]:
-    matching = [key for key, (suffix, _) in FORMATS.items() if suffix == target.suffix]
-    if target.name.lower().endswith(".compressed.ply"):
-        raise ValueError(
-            f"convert: OUT must end in plain .ply, got {target.name}, a format of PlayCanvas that is not written"
-        )
+    compressed = target.name.lower().endswith(_COMPRESSED)
+    ending = _COMPRESSED if compressed else target.suffix
+    matching = [key for key, (suffix, _) in FORMATS.items() if suffix == ending]
     if name is None and not matching:
         suffixes = ", ".join(dict.fromkeys(suffix for suffix, _ in FORMATS.values()))
         raise ValueError(f"convert: OUT must end in {suffixes}, got {target.name}")
-    if name is None and len(matching) > 1 and target.suffix != ".ply":
+    if name is None and len(matching) > 1 and ending != ".ply":
         raise ValueError(
             f"convert: OUT needs --as {' or '.join(matching)}, got {target.name} alone"
         )
@@ -120,7 +119,7 @@ def _convert_gaussians(source: Path, target: Path, name: str | None, drop: bool)
         suffix = FORMATS[name][0] if name in FORMATS else "nothing, as cameras do,"
         raise ValueError(f"convert: OUT must end in {suffix} for --as {name}, got {target}")
     read = read_gaussians(source, drop=drop)
-    if name is None and target.suffix == ".ply":
+    if name is None and ending == ".ply":
         name = "vlgs" if read.has_language else "3dgs-ply"
     name = name or matching[0]
     lost = write_gaussians(target, read, name)

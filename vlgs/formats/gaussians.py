@@ -7,6 +7,7 @@ from pathlib import Path
 from torch import Tensor
 
 from vlgs.formats.checkpoint import parse_checkpoint, write_checkpoint
+from vlgs.formats.compressed import write_compressed
 from vlgs.formats.splat import parse_splat, write_splat
 from vlgs.gaussians.parameters import complete
 from vlgs.gaussians.ply import PLAIN, parse_ply, read_notes, write_ply
@@ -17,6 +18,7 @@ FORMATS: Mapping[str, tuple[str, str]] = {
     "vlgs": (".ply", "3DGS PLY with lang_* and indicator"),
     "3dgs-ply": (".ply", "3DGS PLY"),
     "feature3dgs": (".ply", "3DGS PLY with semantic_*"),
+    "compressed-ply": (".compressed.ply", "PlayCanvas's compressed PLY, 16 bytes a Gaussian"),
     "splat": (".splat", "32 bytes a Gaussian; no view dependence, no language"),
     "3dgs": (".pth", "3DGS checkpoint, 12 values"),
     "langsplat": (".pth", "LangSplat checkpoint, 13 values"),
@@ -113,6 +115,8 @@ def write_gaussians(path: str | Path, imported: Imported, name: str) -> tuple[st
     if name in ("vlgs", "3dgs-ply", "feature3dgs"):
         dialect = "3dgs" if name == "3dgs-ply" else name
         write_ply(path, params, dialect, imported.notes if name == "vlgs" else ())
+    elif name == "compressed-ply":
+        write_compressed(path, params)
     elif name == "splat":
         write_splat(path, params)
     elif name in ("3dgs", "langsplat"):
@@ -128,7 +132,7 @@ def _lost(imported: Imported, name: str) -> list[str]:
         lost.append("spherical harmonics above degree 0")
     if name == "splat" and (bright := int((sh_to_rgb(params["sh0"]) > 1).any(dim=1).sum())):
         lost.append(f"colours above 1, of {bright} Gaussians")
-    if name in ("splat", "3dgs-ply", "3dgs") and imported.has_language:
+    if name in ("splat", "compressed-ply", "3dgs-ply", "3dgs") and imported.has_language:
         lost.append("language features")
     if name != "vlgs" and not params["indicator_logits"].equal(params["opacity_logits"]):
         lost.append("indicators")

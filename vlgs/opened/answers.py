@@ -61,6 +61,15 @@ def ask_view(field: Field, camera: Camera, asked: Questions) -> Answers:
 
 
 @torch.no_grad()
+def gaussian_relevancy(gaussians: HasGaussians, asked: Questions) -> Float[Tensor, "k n"]:
+    """Relevancy of each word for each Gaussian of one mask level, asked for itself."""
+    text = torch.cat([asked.prompts.text, asked.prompts.negatives])
+    found = gaussians.gaussian_similarity(text)[0]
+    own, negatives = found.split([len(asked.prompts.text), len(asked.prompts.negatives)])
+    return asked.query.relevancy(own, negatives)
+
+
+@torch.no_grad()
 def select_gaussians(
     field: Field, asked: Questions, word: int, threshold: float, level: int | None = None
 ) -> tuple[HasGaussians, Bool[Tensor, " n"]]:
@@ -84,12 +93,9 @@ def select_gaussians(
     levels = gaussians_of(field)
     if levels is None:
         raise ValueError(f"select: field must have Gaussians, got one without: {NO_GAUSSIANS}")
-    text = torch.cat([asked.prompts.text, asked.prompts.negatives])
     best: tuple[float, HasGaussians, Tensor] | None = None
     for gaussians in levels if level is None else [levels[level]]:
-        found = gaussians.gaussian_similarity(text)[0]
-        own, negatives = found.split([len(asked.prompts.text), len(asked.prompts.negatives)])
-        relevancy = asked.query.relevancy(own, negatives)[word]
+        relevancy = gaussian_relevancy(gaussians, asked)[word]
         weight = gaussians.language_weights()
         seen = torch.minimum(gaussians.opacities(), weight if weight.dim() == 1 else weight.amax(1))
         chosen = (relevancy > threshold) & (seen >= LEAST)

@@ -1,0 +1,160 @@
+"""What is exported of a run: its Gaussians as other programs draw them, and what they answer."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from vlgs.fields import NO_GAUSSIANS, HasGaussians, PointCloud, gaussians_of
+from vlgs.gaussians.ply import SH_COEFFICIENTS
+from vlgs.geometry import camera_center
+from vlgs.opened import OpenedRun
+from vlgs.opened.answers import LEAST, gaussian_relevancy, select_gaussians, tie
+
+
+@dataclass(frozen=True)
+class Word:
+    """What every Gaussian answers to a word."""
+
+    name: str
+    relevancy: Float[Tensor, " n"]
+    weight: int
+    """Place in `Content.weights` of what blends it."""
+    threshold: float
+    """Relevancy above which it answers."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """Gaussians to be written, and what should be said of them."""
+
+    cloud: PointCloud
+    weights: Sequence[Float[Tensor, " n"]] = ()
+    """What blends language: one for all words, or one for each mask level that answers one."""
+    words: Sequence[Word] = ()
+    notes: Sequence[str] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.cloud.params["means"])
+
+    def keep(self, rows: Int[Tensor, " m"]) -> "Content":
+        """The same with some of the Gaussians, in an order."""
+        params = {name: value[rows] for name, value in self.cloud.params.items()}
+        return replace(
+            self,
+            cloud=PointCloud(params, self.cloud.notes),
+            weights=[weight[rows] for weight in self.weights],
+            words=[replace(word, relevancy=word.relevancy[rows]) for word in self.words],
+        )
+
+    def with_harmonics(self, degree: int) -> "Content":
+        """The same without the spherical harmonics above a degree."""
+        params = dict(self.cloud.params)
+        params["shN"] = params["shN"][:, : SH_COEFFICIENTS[degree]]
+        return replace(self, cloud=PointCloud(params, self.cloud.notes))
+
+
+def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) -> Content:
+    """The Gaussians of a run, and what each of them answers to words.
+
+    Where mask levels share their Gaussians every word is answered by the level that `vlgs.opened.answers.select_gaussians` takes for
+    it. Where each level has Gaussians of its own there is one level for all words: the one that most of them are answered by.
+
+    Args:
+        opened: The run.
+        names: Words; none are needed.
+        level: Place of a mask level that answers all words.
+
+    Raises:
+        ValueError: If the field has no Gaussians, or a word cannot be encoded.
+    """
+    levels = _levels(opened)
+    if not names:
+        return Content(_cloud(opened, levels[-1 if level is None else level]))
+    asked = opened.ask(names)
+    threshold = tie(asked.query, len(names))
+    places = [level] * len(names)
+    if level is None:
+        chosen = [select_gaussians(opened.field, asked, k, threshold) for k in range(len(names))]
+        places = [levels.index(gaussians) for gaussians, _ in chosen]
+        if not isinstance(opened.field, HasGaussians):
+            # Of levels that answer equally many words the one of larger objects.
+            most = max(Counter(sorted(places, reverse=True)).items(), key=lambda pair: pair[1])[0]
+            places = [most] * len(names)
+    used = sorted({place for place in places if place is not None})
+    relevancy = {place: gaussian_relevancy(levels[place], asked) for place in used}
+    weights = [_weight(levels[place]) for place in used]
+    if all(weight.equal(weights[0]) for weight in weights):
+        weights = weights[:1]
+    words = []
+    for index, (name, place) in enumerate(zip(names, places, strict=True)):
+        assert place is not None
+        own = used.index(place) if len(weights) > 1 else 0
+        words.append(Word(name, relevancy[place][index], own, threshold))
+    notes = [asked.note] if asked.note else []
+    return Content(_cloud(opened, levels[used[-1]]), weights, words, notes)
+
+
+def selected(
+    opened: OpenedRun, name: str, level: int | None = None, threshold: float | None = None
+) -> Content:
+    """The Gaussians that answer a word (`vlgs.opened.answers.select_gaussians`).
+
+    Raises:
+        ValueError: If the field has no Gaussians, the word cannot be encoded, or none answers.
+    """
+    _levels(opened)
+    asked = opened.ask([name])
+    bound = tie(asked.query, 1) if threshold is None else threshold
+    gaussians, chosen = select_gaussians(opened.field, asked, 0, bound, level)
+    if not chosen.any():
+        raise ValueError(
+            f"select: {name!r} must be answered by a Gaussian above {bound:g}, got none"
+        )
+    notes = [f"those that answer {name}, above a relevancy of {bound:g}"]
+    notes += [asked.note] if asked.note else []
+    return replace(Content(_cloud(opened, gaussians)).keep(chosen.nonzero()[:, 0]), notes=notes)
+
+
+def drawn(content: Content) -> Content:
+    """Without Gaussians that no weight draws anywhere."""
+    opacity = content.cloud.params["opacity_logits"].sigmoid()
+    largest = torch.stack([opacity, *content.weights]).amax(dim=0)
+    return content.keep((largest >= LEAST).nonzero()[:, 0])
+
+
+def most_important(content: Content, opened: OpenedRun, most: int) -> Content:
+    """At most so many Gaussians: those with the largest opacity times area, as seen from the camera that is nearest to them."""
+    if content.count <= most:
+        return content
+    params = content.cloud.params
+    eyes = torch.stack([camera_center(one.camera.viewmat) for one in opened.cameras()])
+    near = torch.cdist(params["means"], eyes).amin(dim=1).clamp_min(1e-6)
+    area = params["log_scales"].sort(dim=1).values[:, 1:].sum(dim=1) - 2 * near.log()
+    matter = torch.nn.functional.logsigmoid(params["opacity_logits"]) + area
+    rows = matter.argsort(descending=True, stable=True)[:most].sort().values
+    note = f"{most:,} of {content.count:,} Gaussians, those with the largest opacity times area"
+    return replace(content.keep(rows), notes=[*content.notes, note])
+
+
+def _levels(opened: OpenedRun) -> Sequence[HasGaussians]:
+    levels = gaussians_of(opened.field)
+    if levels is None:
+        raise ValueError(f"{opened.path}: must have Gaussians to be exported, got {NO_GAUSSIANS}")
+    return levels
+
+
+def _cloud(opened: OpenedRun, gaussians: HasGaussians) -> PointCloud:
+    cameras = opened.cameras("train") or opened.cameras()
+    return gaussians.point_cloud([one.camera for one in cameras])
+
+
+def _weight(gaussians: HasGaussians) -> Float[Tensor, " n"]:
+    """What blends the language of one level."""
+    weight = gaussians.language_weights()
+    return weight if weight.dim() == 1 else weight[:, 0]
