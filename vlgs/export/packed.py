@@ -61,14 +61,14 @@ def pack(content: Content, center: Float[Tensor, " 3"], unit: float) -> Packed:
     rgb = sh_to_rgb(params["sh0"])
     color = (min(0.0, _quantile(rgb, _RARE)), max(1.0, _quantile(rgb, 1 - _RARE)))
     columns["color"] = _bytes(rgb, *color)
-    columns["opacity"] = _bytes(params["opacity_logits"].sigmoid()[:, None], 0, 1)
+    columns["opacity"] = _bytes(params["opacity_logits"].sigmoid()[:, None], 0.0, 1.0)
     further = params["shN"].flatten(1)
     reach = _quantile(further.abs(), 1 - _RARE) if further.numel() else 0.0
     if reach > 0:
         columns["harmonics"] = _bytes(further, -reach, reach)
     words = []
     if content.words:
-        columns["weights"] = _bytes(torch.stack(list(content.weights), dim=1), 0, 1)
+        columns["weights"] = _bytes(torch.stack(list(content.weights), dim=1), 0.0, 1.0)
         ranges = [_range(word.relevancy) for word in content.words]
         answers = zip(content.words, ranges, strict=True)
         columns["relevancy"] = torch.cat(

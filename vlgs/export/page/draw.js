@@ -11,7 +11,6 @@ class Painter {
     this.fine = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.splats = this.program(SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.whole = this.program(WHOLE_VERTEX, WHOLE_FRAGMENT);
-    this.count = 0;
 
     this.places = placesOf(columns);
     this.rows = Math.ceil(about.count / ROW);
@@ -25,13 +24,12 @@ class Painter {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, 256, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, heat);
     this.targets = [this.target(), this.target()];
 
-    this.array = gl.createVertexArray();
-    gl.bindVertexArray(this.array);
-    this.indices = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    // Two triangles a splat in one mesh: an instance of four corners each is slow on most drivers.
+    this.sequence = this.texture();
+    const corners = new Uint32Array(6 * about.count);
+    for (let i = 0; i < about.count; i++) corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 1, 4 * i + 3, 4 * i + 2], 6 * i);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
   }
 
   program(vertex, fragment) {
@@ -43,7 +41,6 @@ class Painter {
       gl.compileShader(shader);
       gl.attachShader(program, shader);
     }
-    gl.bindAttribLocation(program, 0, "splat");
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
       const said = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
@@ -101,9 +98,10 @@ class Painter {
   // The order in which splats are drawn from now on, the furthest first.
   order(indices) {
     const gl = this.gl;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-    gl.bufferData(gl.ARRAY_BUFFER, indices, gl.DYNAMIC_DRAW);
-    this.count = indices.length;
+    const rows = new Uint32Array(this.rows * ROW);
+    rows.set(indices);
+    gl.bindTexture(gl.TEXTURE_2D, this.sequence);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, this.rows, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, rows);
   }
 
   // Which word is asked from now on, of `about.words`.
@@ -140,6 +138,14 @@ class Painter {
     gl.uniform1i(at.shown, { colour: 0, heat: 1, cut: 2 }[shown]);
     gl.uniform1f(at.threshold, threshold);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.deleteSync(this.fence ?? null);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+
+  // Whether the last picture is not finished yet; more than one at a time would only make the page slow to answer.
+  busy() {
+    return Boolean(this.fence) && this.gl.getSyncParameter(this.fence, this.gl.SYNC_STATUS) === this.gl.UNSIGNALED;
   }
 
   layer(target, view, width, height, language) {
@@ -178,8 +184,8 @@ class Painter {
     this.bind(at.shapes, 0, language ? this.own : this.shapes);
     this.bind(at.answers, 1, this.answers);
     this.bind(at.harmonics, 2, this.harmonics, gl.TEXTURE_2D_ARRAY);
-    gl.bindVertexArray(this.array);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    this.bind(at.sequence, 3, this.sequence);
+    gl.drawElements(gl.TRIANGLES, 6 * about.count, gl.UNSIGNED_INT, 0);
   }
 
   bind(location, unit, texture, kind = this.gl.TEXTURE_2D) {

@@ -1,7 +1,7 @@
 // The page: what is drawn when, and what its buttons do.
 
 const find = (id) => document.getElementById(id);
-const SLOW = 45; // milliseconds for a frame, above which a moving picture is drawn with half the pixels
+const AIM = 30; // milliseconds between frames of a moving picture, which is drawn with fewer pixels if it takes longer
 
 class Page {
   constructor(painter) {
@@ -9,8 +9,10 @@ class Page {
     this.canvas = painter.canvas;
     this.sorter = new Sorter(painter.places);
     this.word = null;
-    this.pace = 0; // mean of milliseconds between frames while the picture moves
-    this.touched = 0;
+    this.touched = -Infinity; // when the view was last moved
+    this.pace = 0; // milliseconds between frames while it moves
+    this.share = 1; // of the pixels along an axis, while it moves
+    this.step = 0; // its logarithm
     this.seat(about.start);
     new ResizeObserver(() => this.show()).observe(this.canvas);
   }
@@ -37,26 +39,33 @@ class Page {
   frame(now) {
     this.wanted = 0;
     if (this.lent) return; // to `look`
+    if (this.painter.busy()) return this.show();
     const moving = now - this.touched < 250;
     this.measure(now, moving);
-    this.draw(moving && this.pace > SLOW ? 0.5 : 1);
+    this.draw(moving ? this.share : 1);
     this.sort();
     if (moving) this.show(); // and once more when it rests, with all pixels
   }
 
-  // Frames a second, in small letters, while there is motion.
+  // Frames a second, in small letters, while there is motion; and with how many pixels a moving picture is drawn.
   measure(now, moving) {
-    if (moving && this.last && now - this.last < 1000) this.pace += (now - this.last - this.pace) / 8;
+    if (moving && this.last) {
+      this.pace += (now - this.last - this.pace) / (this.pace ? 4 : 1);
+      find("rate").textContent = `${Math.round(1000 / this.pace)} frames/s`;
+      // The work goes with the square of the share. Steps of the root of 2, so that a size lasts for some frames.
+      const wanted = this.share * Math.sqrt(AIM / this.pace);
+      const step = Math.round(2 * Math.log2(Math.min(1, Math.max(0.2, wanted))));
+      if (Math.abs(step - this.step) > 1 || step === 0) this.step = step;
+      this.share = 2 ** (this.step / 2);
+    }
+    if (!moving) find("rate").textContent = "";
     this.last = moving ? now : 0;
-    find("rate").textContent = moving && this.pace ? `${Math.round(1000 / this.pace)} frames/s` : "";
   }
 
   draw(share) {
     const ratio = Math.min(devicePixelRatio || 1, 2) * share;
-    this.painter.paint(
-      this.view, Math.max(1, Math.round(this.canvas.clientWidth * ratio)), Math.max(1, Math.round(this.canvas.clientHeight * ratio)),
-      ...this.style(),
-    );
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    this.painter.paint(this.view, width, height, ...this.style());
   }
 
   style() {
@@ -86,17 +95,16 @@ class Page {
     find("answer").hidden = this.word === null;
     if (this.word !== null) {
       const { low, high, threshold } = about.words[this.word];
-      Object.assign(find("threshold"), { min: low, max: high, step: (high - low) / 200 || "any", value: threshold });
+      Object.assign(find("threshold"), { min: low, max: high, step: "any", value: threshold });
       this.painter.ask(this.word);
     }
     this.tell();
   }
 
   tell() {
-    const value = find("threshold").valueAsNumber.toFixed(3);
-    find("value").value = value;
-    const said = this.word === null ? "" : `${about.words[this.word].name}: above a relevancy of ${value}`;
-    find("status").textContent = said || `${about.count.toLocaleString()} Gaussians.`;
+    find("value").value = find("threshold").valueAsNumber.toFixed(3);
+    const asked = this.word === null ? "" : `, asked for ${about.words[this.word].name}`;
+    find("status").textContent = `${about.count.toLocaleString()} Gaussians${asked}.`;
     this.show();
   }
 
@@ -137,7 +145,7 @@ function connect(page) {
   const pan = (across, over) => page.move((view) => view.pan(across, over, ...size()));
   const dolly = (factor) => page.move((view) => view.dolly(factor));
   const angle = () => Math.PI / Math.min(...size()); // a turn by half the circle from one edge to the other
-  followHand(page.canvas, { orbit: (x, y) => turn(x * angle(), -y * angle()), pan, dolly });
+  followHand(page.canvas, { orbit: (x, y) => turn(-x * angle(), -y * angle()), pan, dolly });
 
   const ways = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
   const keys = {
@@ -146,12 +154,12 @@ function connect(page) {
     Escape: () => page.word !== null && page.ask(page.word),
   };
   addEventListener("keydown", (event) => {
-    const typing = /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName) && event.key !== "Escape";
-    if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
     const way = ways[event.key];
+    const theirs = event.target.matches("select") ? event.key !== "Escape" : event.target.matches("input") && way;
+    if (theirs || event.ctrlKey || event.metaKey || event.altKey) return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (way && event.shiftKey) pan(-20 * way[0], -20 * way[1]);
-    else if (way) turn(-0.05 * way[0], 0.05 * way[1]);
+    else if (way) turn(0.05 * way[0], 0.05 * way[1]);
     else if (keys[key]) keys[key]();
     else if (/^[1-9]$/.test(key) && about.words[key - 1]) page.ask(key - 1);
     else return;

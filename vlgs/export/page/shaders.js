@@ -3,7 +3,7 @@
 const SPLAT_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
-uniform highp usampler2D shapes;
+uniform highp usampler2D shapes, sequence;
 uniform sampler2D answers;             // language weight, relevancy
 uniform highp sampler2DArray harmonics;
 uniform vec3 right, down, ahead, eye;  // rows of the rotation, and where the camera is
@@ -14,7 +14,6 @@ uniform float near, blur, least;
 uniform vec2 colors, further;          // what 0 and 1 stand for, of colours and of harmonics
 uniform int coefficients;
 uniform bool language;
-in uint splat;
 out vec2 place;                        // in standard deviations
 flat out vec4 ink;                     // what is blended, and with which weight
 
@@ -33,7 +32,9 @@ vec3 seen(vec3 color, ivec2 at, vec3 way) {
 
 void main() {
   gl_Position = vec4(0., 0., 2., 1.);  // outside of everything
-  ivec2 at = ivec2(splat % ${ROW}u, splat / ${ROW}u);
+  int turn = gl_VertexID >> 2, corner = gl_VertexID & 3;
+  int splat = int(texelFetch(sequence, ivec2(turn % ${ROW}, turn / ${ROW}), 0).r);
+  ivec2 at = ivec2(splat % ${ROW}, splat / ${ROW});
   ivec2 texel = ivec2(at.x * ${TEXELS}, at.y);
   uvec4 first = texelFetch(shapes, texel, 0);
   vec3 way = uintBitsToFloat(first.xyz) - eye;
@@ -63,7 +64,7 @@ void main() {
   axis = gap > 1e-6 * middle ? normalize(axis) : vec2(1., 0.);
   vec2 lengths = sqrt(vec2(middle + gap, max(middle - gap, blur)));
 
-  place = (vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2. - 1.) * sqrt(2. * log(ink.a / least) + 1e-6);
+  place = (vec2(corner & 1, corner >> 1) * 2. - 1.) * sqrt(2. * log(ink.a / least) + 1e-6);
   vec2 pixel = lens.xy * there.xy / there.z + lens.zw;
   pixel += place.x * lengths.x * axis + place.y * lengths.y * vec2(-axis.y, axis.x);
   gl_Position = vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0., 1.);
