@@ -97,6 +97,9 @@ def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) ->
         own = used.index(place) if len(weights) > 1 else 0
         words.append(Word(name, relevancy[place][index], own, threshold))
     notes = [asked.note] if asked.note else []
+    if len(levels) > 1 and not isinstance(opened.field, HasGaussians):
+        number = opened.notes.levels[used[0]]
+        notes.append(f"the Gaussians of mask level {number}, which answers all words")
     return Content(_cloud(opened, levels[used[-1]]), weights, words, notes)
 
 

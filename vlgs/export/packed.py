@@ -7,7 +7,7 @@ A column is all Gaussians' first bytes, then all second ones: neighbours in the 
     quats       4   w x y z of the unit quaternion, 127 + 127 q
     color       3   of degree 0, between bounds that are common to all channels
     opacity     1   255 o
-    harmonics   3k  red, green, blue of each coefficient above degree 0, between common bounds
+    harmonics   3k  red, green, blue of each coefficient above degree 0, in few steps: see `_HARMONIC_STEPS`
     weights     w   255 l: what blends language, one or one for each mask level that answers a word
     relevancy   k   of each word, between its least and its largest
     language_scales, language_quats   where language has shapes of its own
@@ -29,6 +29,9 @@ from vlgs.gaussians.sh import sh_to_rgb
 
 _RARE = 1e-3
 """Share of colours at each end that may be clipped: a few very bright ones would take the steps of all others."""
+
+_HARMONIC_STEPS = 8
+"""To each side of 0. Of glassware's pictures 15 change 66 dB and take 29 bytes a Gaussian in the page, 127 change 73 dB and take 48."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ def pack(content: Content, center: Float[Tensor, " 3"], unit: float) -> Packed:
     further = params["shN"].flatten(1)
     reach = _quantile(further.abs(), 1 - _RARE) if further.numel() else 0.0
     if reach > 0:
-        columns["harmonics"] = _bytes(further, -reach, reach)
+        steps = (further / reach * _HARMONIC_STEPS).round().clamp(-_HARMONIC_STEPS, _HARMONIC_STEPS)
+        columns["harmonics"] = (steps + _HARMONIC_STEPS).to(torch.uint8)
     words = []
     if content.words:
         columns["weights"] = _bytes(torch.stack(list(content.weights), dim=1), 0.0, 1.0)
@@ -87,7 +91,7 @@ def pack(content: Content, center: Float[Tensor, " 3"], unit: float) -> Packed:
         "places": {"center": center.tolist(), "unit": unit, **bounds},
         "scales": {"low": scales[0], "high": scales[1]},
         "color": color,
-        "harmonics": (-reach, reach),
+        "harmonics": (-reach, reach * (255 / _HARMONIC_STEPS - 1)),  # what 0 and 255 stand for
         "words": words,
     }
     raw = b"".join(column.T.contiguous().numpy().tobytes() for column in columns.values())
