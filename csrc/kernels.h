@@ -172,9 +172,8 @@ constexpr int kSlotHead = 8;  // where wide channels begin
 // tile_intersect: block masks of one Gaussian over the tiles of a box, row by row.
 // rasterize_forward, rasterize_backward: one tile; with scratch as large as its *_scratch says. Backward
 //   writes one slot per entry of the tile's list and says whether all it read was finite.
-// median_rows: one tile of an image: the row of the Gaussian of the first chain behind which at most half of
-// the
-//   light is left, -1 where more is left behind all.
+// median_rows: one tile of an image: row of the Gaussian behind which at most half of the first chain's light
+//   is left, -1 where more is left behind all.
 // cache_weights: weights of the first chain of one tile: entries per block, and if `ids` is given the entries
 //   themselves. cached_weights_render: one block of pixels of an image; scratch [channels, kPixels].
 //   cached_weights_upstream, cached_weights_backward: a block of pixels as [channels, kPixels], then the
