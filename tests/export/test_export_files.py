@@ -22,7 +22,7 @@ from vlgs.fields import PointCloud
 from vlgs.fields.planes import PlaneField
 from vlgs.formats import read_gaussians
 from vlgs.opened import OpenedRun
-from vlgs.opened.answers import select_gaussians
+from vlgs.opened.answers import ranges, select_gaussians
 from vlgs.run import run
 
 SOURCES = Path(__file__).parents[2] / "vlgs" / "export" / "page"
@@ -81,7 +81,7 @@ def test_an_unfinished_run_shows_its_last_checkpoint(
     for name in ("metrics.json", "field.safetensors"):
         (tmp_path / "run" / name).unlink()
     main([str(tmp_path / "run"), str(tmp_path / "a.html"), "--words", "mug"])
-    assert "the run is not finished: this is step 9" in capsys.readouterr().out
+    assert "not finished, shown as of step 9" in capsys.readouterr().err
     assert "Training goes on: this is step 9." in (tmp_path / "a.html").read_text()
 
 
@@ -103,8 +103,9 @@ def test_an_unfinished_run_shows_its_last_checkpoint(
         (["{run}", "{folder}/a.ply", "--words", "mug"], "--words must go with .html, got a.ply"),
         (
             ["{run}", "{folder}/a.ply", "--level", "2"],
-            "--level must be one of the run's (3), got 2",
+            "level must be one of the run's, 3, got 2",
         ),
+        (["{run}", "{folder}/a.html", "--most", "0"], "export: most must be at least 1, got 0"),
         (["{run}", "{folder}/a.html", "--vocabulary", "{folder}/none.npz"], "none.npz"),
     ],
 )
@@ -140,8 +141,10 @@ def test_a_field_without_gaussians_and_one_without_language(opened: OpenedRun, t
 
 def test_only_what_answers_is_selected(opened: OpenedRun, tmp_path: Path):
     lines = export(opened, tmp_path / "a.ply", Wanted(select="green ball"))
-    assert lines[1] == "those that answer green ball, above a relevancy of 0.5"
-    _, chosen = select_gaussians(opened.field, opened.ask(["green ball"]), 0, 0.5)
+    asked, cameras = opened.ask(["green ball"]), [one.camera for one in opened.held_out()]
+    threshold = ranges(opened.field, cameras, asked)[0].threshold()
+    assert lines[1] == f"those that answer 'green ball', above a relevancy of {threshold:.3f}"
+    _, chosen = select_gaussians(opened.field, asked, 0, threshold)
     means = read_gaussians(tmp_path / "a.ply").params["means"]
     assert means.equal(opened.field.model.splats["means"][chosen])  # type: ignore[attr-defined]
     assert 140 < len(means) <= 160

@@ -9,6 +9,7 @@ from vlgs.export.page import write_page
 from vlgs.files import write_atomically
 from vlgs.formats import FORMATS, Imported, write_gaussians
 from vlgs.opened import OpenedRun
+from vlgs.values import require_range
 
 __all__ = ["PAGE", "Wanted", "export", "kind_of"]
 
@@ -20,13 +21,15 @@ _KINDS = {
     ".splat": "splat",
 }
 """Suffix -> what is written."""
-_PAGE_HARMONICS = 3
-"""Degree of a page's colours, if nothing is said."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What should be in the file. None: as it is without the option."""
+    """What should be in the file. None: as it is without the option.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
 
     words: Sequence[str] | None = None
     """That a page can be asked; None: the classes of the scene, if its language can be asked."""
@@ -38,6 +41,11 @@ class Wanted:
     """Gaussians to keep."""
     harmonics: int | None = None
     """Highest degree of the spherical harmonics to keep."""
+
+    def __post_init__(self) -> None:
+        if self.most is not None and self.most < 1:
+            raise ValueError(f"export: most must be at least 1, got {self.most}")
+        require_range("export", 0, 3, harmonics=self.harmonics)
 
 
 def kind_of(target: Path) -> str:
@@ -72,9 +80,8 @@ def export(opened: OpenedRun, target: Path, wanted: Wanted) -> list[str]:
         content = selected(opened, wanted.select, level)
     else:
         content = answer(opened, _words(opened, kind, wanted), level)
-    if wanted.harmonics is not None or kind == "page":
-        degree = _PAGE_HARMONICS if wanted.harmonics is None else wanted.harmonics
-        content = content.with_harmonics(degree)
+    if wanted.harmonics is not None:
+        content = content.with_harmonics(wanted.harmonics)
     if kind == "page":
         content = drawn(content)
     if content.count == 0:
@@ -97,8 +104,6 @@ def _said(opened: OpenedRun, target: Path, kind: str, content: Content) -> list[
     if kind == "page":
         words = ", ".join(word.name for word in content.words)
         lines.append(f"words: {words}" if words else "no words")
-    if opened.step is not None:
-        lines.append(f"the run is not finished: this is step {opened.step}")
     return [*lines, *content.notes]
 
 
@@ -118,10 +123,9 @@ def _place(opened: OpenedRun, number: int | None) -> int | None:
     """
     if number is None:
         return None
-    count, named = len(opened.field.levels()), opened.notes.levels
-    # A field that answers for all levels at once has none to choose from.
-    places = {name: place for place, name in enumerate(named)} if len(named) == count else {}
-    if number not in places:
-        known = ", ".join(str(name) for name in places if name is not None) or "none to choose from"
-        raise ValueError(f"export: --level must be one of the run's ({known}), got {number}")
-    return places[number]
+    place = opened.place(number)
+    if place >= len(opened.field.levels()):
+        raise ValueError(
+            f"{opened.path}: level must not be given where all levels answer as one, got {number}"
+        )
+    return place

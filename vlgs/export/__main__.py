@@ -1,11 +1,10 @@
 """Write a trained scene to one file: `python -m vlgs.export RUN OUT`; see `--help`."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from vlgs.export import Wanted, export, kind_of
-from vlgs.opened import open_run
+from vlgs.opened.commands import add_words, command, opened
 from vlgs.text import screen
 
 _HELP = """OUT, by suffix:
@@ -35,27 +34,19 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--select", metavar="WORD", help="only the Gaussians that answer it")
     parser.add_argument("--level", type=int, metavar="N", help="mask level that answers")
-    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="further words")
-    parser.add_argument(
-        "--text", metavar="MODEL", help="CLIP or SigLIP for words that no vocabulary has"
-    )
     parser.add_argument(
         "--most", type=int, metavar="N", help="keep the N Gaussians with the largest opacity x area"
     )
     parser.add_argument(
         "--harmonics", type=int, choices=range(4), help="highest degree to keep; default: all"
     )
-    given = parser.parse_args(arguments)
-    if given.most is not None and given.most < 1:
-        parser.error(f"--most must be 1 or more, got {given.most}")
-    wanted = Wanted(_split(given.words), given.select, given.level, given.most, given.harmonics)
-    try:
-        kind_of(given.out)  # before anything is loaded
-        opened = open_run(given.run, given.vocabulary, given.text)
-        for line in export(opened, given.out, wanted):
-            sys.stdout.write(f"{screen(line)}\n")
-    except (ValueError, OSError) as error:
-        sys.exit(screen(f"error: {error}"))
+    add_words(parser)
+    args = parser.parse_args(arguments)
+    with command():
+        kind_of(args.out)  # before anything is loaded
+        wanted = Wanted(_split(args.words), args.select, args.level, args.most, args.harmonics)
+        for line in export(opened(args), args.out, wanted):
+            print(screen(line))
 
 
 def _split(words: str | None) -> list[str] | None:

@@ -12,7 +12,8 @@ from vlgs.fields import NO_GAUSSIANS, HasGaussians, PointCloud, gaussians_of
 from vlgs.gaussians.ply import SH_COEFFICIENTS
 from vlgs.geometry import camera_center
 from vlgs.opened import OpenedRun
-from vlgs.opened.answers import LEAST, gaussian_relevancy, select_gaussians, tie
+from vlgs.opened.answers import LEAST, Range, gaussian_relevancy, ranges, select_gaussians
+from vlgs.query import Questions
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class Word:
     relevancy: Float[Tensor, " n"]
     weight: int
     """Place in `Content.weights` of what blends it."""
-    threshold: float
-    """Relevancy above which it answers."""
+    range: Range
+    """What heat maps show, and above what a Gaussian answers; as `vlgs.query` has it."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,11 @@ def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) ->
     if not names:
         return Content(_cloud(opened, levels[-1 if level is None else level]))
     asked = opened.ask(names)
-    threshold = tie(asked.query, len(names))
+    bounds = _ranges(opened, asked, level)
     places = [level] * len(names)
     if level is None:
-        chosen = [select_gaussians(opened.field, asked, k, threshold) for k in range(len(names))]
+        numbered = enumerate(bounds)
+        chosen = [select_gaussians(opened.field, asked, k, own.threshold()) for k, own in numbered]
         places = [levels.index(gaussians) for gaussians, _ in chosen]
         if not isinstance(opened.field, HasGaussians):
             # Of levels that answer equally many words the one of larger objects.
@@ -95,7 +97,7 @@ def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) ->
     for index, (name, place) in enumerate(zip(names, places, strict=True)):
         assert place is not None
         own = used.index(place) if len(weights) > 1 else 0
-        words.append(Word(name, relevancy[place][index], own, threshold))
+        words.append(Word(name, relevancy[place][index], own, bounds[index]))
     notes = [asked.note] if asked.note else []
     if len(levels) > 1 and not isinstance(opened.field, HasGaussians):
         number = opened.notes.levels[used[0]]
@@ -103,9 +105,7 @@ def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) ->
     return Content(_cloud(opened, levels[used[-1]]), weights, words, notes)
 
 
-def selected(
-    opened: OpenedRun, name: str, level: int | None = None, threshold: float | None = None
-) -> Content:
+def selected(opened: OpenedRun, name: str, level: int | None = None) -> Content:
     """The Gaussians that answer a word (`vlgs.opened.answers.select_gaussians`).
 
     Raises:
@@ -113,13 +113,13 @@ def selected(
     """
     _levels(opened)
     asked = opened.ask([name])
-    bound = tie(asked.query, 1) if threshold is None else threshold
-    gaussians, chosen = select_gaussians(opened.field, asked, 0, bound, level)
+    threshold = _ranges(opened, asked, level)[0].threshold()
+    gaussians, chosen = select_gaussians(opened.field, asked, 0, threshold, level)
     if not chosen.any():
         raise ValueError(
-            f"select: {name!r} must be answered by a Gaussian above {bound:g}, got none"
+            f"export: --select must leave a Gaussian, got none above a relevancy of {threshold:.3f} for {name!r}"
         )
-    notes = [f"those that answer {name}, above a relevancy of {bound:g}"]
+    notes = [f"those that answer {name!r}, above a relevancy of {threshold:.3f}"]
     notes += [asked.note] if asked.note else []
     return replace(Content(_cloud(opened, gaussians)).keep(chosen.nonzero()[:, 0]), notes=notes)
 
@@ -150,6 +150,10 @@ def _levels(opened: OpenedRun) -> Sequence[HasGaussians]:
     if levels is None:
         raise ValueError(f"{opened.path}: must have Gaussians to be exported, got {NO_GAUSSIANS}")
     return levels
+
+
+def _ranges(opened: OpenedRun, asked: Questions, level: int | None) -> Sequence[Range]:
+    return ranges(opened.field, [one.camera for one in opened.held_out()], asked, level)
 
 
 def _cloud(opened: OpenedRun, gaussians: HasGaussians) -> PointCloud:

@@ -23,7 +23,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from vlgs.export.content import Content
+from vlgs.export.content import Content, Word
 from vlgs.formats.compressed import morton_order
 from vlgs.gaussians.sh import sh_to_rgb
 
@@ -70,18 +70,15 @@ def pack(content: Content, center: Float[Tensor, " 3"], unit: float) -> Packed:
     if reach > 0:
         steps = (further / reach * _HARMONIC_STEPS).round().clamp(-_HARMONIC_STEPS, _HARMONIC_STEPS)
         columns["harmonics"] = (steps + _HARMONIC_STEPS).to(torch.uint8)
-    words = []
+    words: list[dict[str, Any]] = []
     if content.words:
         columns["weights"] = _bytes(torch.stack(list(content.weights), dim=1), 0.0, 1.0)
-        ranges = [_range(word.relevancy) for word in content.words]
-        answers = zip(content.words, ranges, strict=True)
+        ends = [_ends(word.relevancy) for word in content.words]
+        answers = zip(content.words, ends, strict=True)
         columns["relevancy"] = torch.cat(
-            [_bytes(word.relevancy[:, None], *ends) for word, ends in answers], dim=1
+            [_bytes(word.relevancy[:, None], *own_ends) for word, own_ends in answers], dim=1
         )
-        for word, (low, high) in zip(content.words, ranges, strict=True):
-            threshold = min(max(word.threshold, low), high)
-            said = {"name": word.name, "weight": word.weight}
-            words.append(said | {"low": low, "high": high, "threshold": threshold})
+        words = [_word(word, own_ends) for word, own_ends in zip(content.words, ends, strict=True)]
     if own and content.words:
         columns["language_scales"] = _bytes(params["language_log_scales"], *scales)
         columns["language_quats"] = _turns(params["language_quats"])
@@ -127,7 +124,14 @@ def _turns(quats: Float[Tensor, "n 4"]) -> UInt8[Tensor, "n 4"]:
     return (unit * 127 + 127).round().to(torch.uint8)
 
 
-def _range(value: Float[Tensor, " n"]) -> tuple[float, float]:
+def _word(word: Word, ends: tuple[float, float]) -> dict[str, Any]:
+    """What the page knows of a word: `stored` are the ends of its bytes, `heat` those of its colours."""
+    heat = (word.range.low, max(word.range.high, word.range.low + 1e-6))
+    said = {"name": word.name, "weight": word.weight, "stored": ends, "heat": heat}
+    return said | {"threshold": min(max(word.range.threshold(), ends[0]), ends[1])}
+
+
+def _ends(value: Float[Tensor, " n"]) -> tuple[float, float]:
     return value.min().item(), value.max().item()
 
 

@@ -5,21 +5,19 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 
 from vlgs.export.content import Content
 from vlgs.export.packed import pack
 from vlgs.fields import Field
 from vlgs.geometry import camera_center
 from vlgs.opened import NamedCamera, OpenedRun
+from vlgs.opened.cameras import focus, upright
 from vlgs.report.colors import heat, to_uint8
 from vlgs.types import RasterConfig
 
@@ -42,12 +40,14 @@ def write_page(opened: OpenedRun, content: Content) -> bytes:
     """
     # The first test camera, or the first of all.
     cameras = sorted(opened.cameras(), key=lambda one: one.split != "test")
-    center, unit = _middle(cameras, content.cloud.params["means"])
-    packed = pack(content, center, unit)
+    viewmats = torch.stack([one.camera.viewmat for one in cameras]).double()
+    eyes = camera_center(viewmats)
+    center = focus(eyes, viewmats[:, 2, :3])
+    packed = pack(content, center, max((eyes - center).norm(dim=1).median().item(), 1e-6))
     constants = RasterConfig()
     about = packed.about | {
         "focus": center.tolist(),
-        "up": _up(cameras).tolist(),
+        "up": upright(viewmats).tolist(),
         "near": constants.near,
         "blur": constants.eps2d,
         "alpha": (constants.alpha_min, constants.alpha_max),
@@ -89,28 +89,6 @@ def _note(opened: OpenedRun, content: Content) -> str:
     if opened.step is not None:
         lines.append(f"Training goes on: this is step {opened.step}.")
     return " ".join([*lines, f"Run {opened.path.resolve().name}."])
-
-
-def _middle(
-    cameras: Sequence[NamedCamera], means: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, " 3"], float]:
-    """What the cameras look at, and how far away they are: the point nearest to all their axes, or the middle of what is there."""
-    viewmats = torch.stack([one.camera.viewmat for one in cameras]).double()
-    eyes, ways = camera_center(viewmats), viewmats[:, 2, :3]
-    across = torch.eye(3, dtype=torch.float64) - ways[:, :, None] * ways[:, None, :]
-    solved = torch.linalg.lstsq(across.sum(dim=0), (across @ eyes[:, :, None]).sum(dim=0))
-    point = solved.solution[:, 0]
-    depths = ((point - eyes) * ways).sum(dim=1)
-    if not point.isfinite().all() or depths.median() <= 0 or torch.linalg.cond(across.sum(0)) > 1e6:
-        point = means.double().median(dim=0).values
-    return point, max((point - eyes).norm(dim=1).median().item(), 1e-6)
-
-
-def _up(cameras: Sequence[NamedCamera]) -> Float[Tensor, " 3"]:
-    """Mean of what is up in the photographs; without any, as if they lay flat, up in the first."""
-    ups = -torch.stack([one.camera.viewmat[1, :3] for one in cameras]).double()
-    mean = ups.mean(dim=0)
-    return torch.nn.functional.normalize(mean if mean.norm() > 0.1 else ups[0], dim=0)
 
 
 def _camera(one: NamedCamera) -> dict[str, Any]:

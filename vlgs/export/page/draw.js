@@ -119,8 +119,9 @@ class Painter {
     this.asked = true;
   }
 
-  // Draws into the canvas at a size in pixels. `shown`: "colour", "heat" or "cut"; `threshold` of a relevancy in 0 ... 1.
-  paint(view, width, height, shown, threshold) {
+  // Draws into the canvas at a size in pixels. `shown`: "colour", "heat" or "cut"; `threshold` and both ends of the heat are shares of a
+  // word's bytes.
+  paint(view, width, height, shown, threshold = 0, [cold, hot] = [0, 1]) {
     const gl = this.gl;
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
@@ -137,6 +138,7 @@ class Painter {
     this.bind(at.heat, 2, this.heat);
     gl.uniform1i(at.shown, { colour: 0, heat: 1, cut: 2 }[shown]);
     gl.uniform1f(at.threshold, threshold);
+    gl.uniform2f(at.ends, cold, hot);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.deleteSync(this.fence ?? null);
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);

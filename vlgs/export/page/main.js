@@ -68,11 +68,13 @@ class Page {
     this.painter.paint(this.view, width, height, ...this.style());
   }
 
+  // What `Painter.paint` is told: how to show the word, and where its threshold and its heat begin and end among its bytes.
   style() {
-    if (this.word === null) return ["colour", 0];
-    const { low, high } = about.words[this.word];
+    if (this.word === null) return ["colour"];
+    const { stored, heat } = about.words[this.word];
+    const share = (relevancy) => (relevancy - stored[0]) / (stored[1] - stored[0] || 1);
     const shown = document.querySelector("input[name=shown]:checked").value;
-    return [shown, (find("threshold").valueAsNumber - low) / (high - low || 1)];
+    return [shown, share(find("threshold").valueAsNumber), heat.map(share)];
   }
 
   // Put splats in order if the direction of the view has changed; one worker, one question at a time.
@@ -94,8 +96,8 @@ class Page {
     for (const [i, button] of [...find("words").children].entries()) button.setAttribute("aria-pressed", String(i === this.word));
     find("answer").hidden = this.word === null;
     if (this.word !== null) {
-      const { low, high, threshold } = about.words[this.word];
-      Object.assign(find("threshold"), { min: low, max: high, step: "any", value: threshold });
+      const { stored, threshold } = about.words[this.word];
+      Object.assign(find("threshold"), { min: stored[0], max: stored[1], step: "any", value: threshold });
       this.painter.ask(this.word);
     }
     this.tell();

@@ -91,7 +91,8 @@ void main() {
 const WHOLE_FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D color, language, heat;
-uniform float threshold;               // of a relevancy stretched to 0 ... 1
+uniform float threshold;               // of a word's bytes, from 0 to 1
+uniform vec2 ends;                     // what is coldest and hottest, likewise
 uniform int shown;                     // 0 colour, 1 heat, 2 cut-out
 out vec4 pixel;
 void main() {
@@ -103,7 +104,8 @@ void main() {
   float relevancy = sum.a > 0. ? sum.r / sum.a : 0.;
   bool answers = sum.a > 0. && relevancy > threshold;
   float grey = dot(plain, vec3(0.299, 0.587, 0.114));
-  vec3 hot = texelFetch(heat, ivec2(relevancy * 255. + 0.5, 0), 0).rgb;
+  float warmth = clamp((relevancy - ends.x) / (ends.y - ends.x), 0., 1.);
+  vec3 hot = texelFetch(heat, ivec2(warmth * 255. + 0.5, 0), 0).rgb;
   if (shown == 1) pixel.rgb = mix(vec3(grey), hot, 0.65) * (answers ? 1. : 0.4);
   else if (!answers) pixel.rgb = vec3(0.3 * grey);
 }`;
