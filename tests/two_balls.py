@@ -70,9 +70,9 @@ def _gaussians(own_shape: bool) -> dict[str, Tensor]:
     params = {
         "means": torch.cat([balls, table]),
         "quats": draw(n, 4),
-        "log_scales": -2.3 + 0.4 * draw(n, 3),
+        "log_scales": -2.9 + 0.7 * draw(n, 3),
         "sh0": rgb_to_sh(_COLORS[kind] + 0.08 * draw(n, 3)),
-        "shN": 0.05 * draw(n, 15, 3),
+        "shN": 0.15 * draw(n, 15, 3),
         "opacity_logits": 1 + draw(n),
         "features": normalize(torch.eye(4)[kind] + 0.05 * draw(n, 4), dim=1),
         "indicator_logits": 1 + draw(n),
