@@ -11,11 +11,10 @@ from vlgs.formats import FORMATS, Imported, write_gaussians
 from vlgs.opened import OpenedRun
 from vlgs.values import require_range
 
-__all__ = ["PAGE", "Wanted", "export", "kind_of"]
+__all__ = ["Wanted", "export", "kind_of"]
 
-PAGE = ".html"
 _KINDS = {
-    PAGE: "page",
+    ".html": "page",
     ".ply": "3dgs-ply",
     ".compressed.ply": "compressed-ply",
     ".splat": "splat",
@@ -72,7 +71,7 @@ def export(opened: OpenedRun, target: Path, wanted: Wanted) -> list[str]:
     if kind == "page" and wanted.select is not None:
         raise ValueError("export: --select must go with a file of Gaussians, got a page: --words")
     if kind != "page" and wanted.words is not None:
-        raise ValueError(f"export: --words must go with {PAGE}, got {target.name}: --select WORD")
+        raise ValueError(f"export: --words must go with .html, got {target.name}: --select WORD")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"export: OUT must be in a folder that exists, got {target}")
     level = _place(opened, wanted.level)

@@ -1,6 +1,5 @@
 """What is exported of a run: its Gaussians as other programs draw them, and what they answer."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -79,23 +78,14 @@ def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) ->
         return Content(_cloud(opened, levels[-1 if level is None else level]))
     asked = opened.ask(names)
     bounds = _ranges(opened, asked, level)
-    places = [level] * len(names)
-    if level is None:
-        numbered = enumerate(bounds)
-        chosen = [select_gaussians(opened.field, asked, k, own.threshold()) for k, own in numbered]
-        places = [levels.index(gaussians) for gaussians, _ in chosen]
-        if not isinstance(opened.field, HasGaussians):
-            # Of levels that answer equally many words the one of larger objects.
-            most = max(Counter(sorted(places, reverse=True)).items(), key=lambda pair: pair[1])[0]
-            places = [most] * len(names)
-    used = sorted({place for place in places if place is not None})
+    places = [level] * len(names) if level is not None else _places(opened, asked, bounds)
+    used = sorted(set(places))
     relevancy = {place: gaussian_relevancy(levels[place], asked) for place in used}
     weights = [_weight(levels[place]) for place in used]
     if all(weight.equal(weights[0]) for weight in weights):
         weights = weights[:1]
     words = []
     for index, (name, place) in enumerate(zip(names, places, strict=True)):
-        assert place is not None
         own = used.index(place) if len(weights) > 1 else 0
         words.append(Word(name, relevancy[place][index], own, bounds[index]))
     notes = [asked.note] if asked.note else []
@@ -150,6 +140,18 @@ def _levels(opened: OpenedRun) -> Sequence[HasGaussians]:
     if levels is None:
         raise ValueError(f"{opened.path}: must have Gaussians to be exported, got {NO_GAUSSIANS}")
     return levels
+
+
+def _places(opened: OpenedRun, asked: Questions, bounds: Sequence[Range]) -> list[int]:
+    """Place of the mask level that answers each word."""
+    levels, places = _levels(opened), []
+    for index, own in enumerate(bounds):
+        gaussians, _ = select_gaussians(opened.field, asked, index, own.threshold())
+        places.append(levels.index(gaussians))
+    if isinstance(opened.field, HasGaussians):
+        return places
+    # Of levels that answer equally many words the one of larger objects.
+    return [max(set(places), key=lambda place: (places.count(place), place))] * len(places)
 
 
 def _ranges(opened: OpenedRun, asked: Questions, level: int | None) -> Sequence[Range]:

@@ -25,7 +25,7 @@ _SOURCES = Path(__file__).with_name("page")
 _SCRIPTS = ("data.js", "order.js", "camera.js", "shaders.js", "draw.js", "main.js")
 """In the order in which they are joined to one script."""
 _POLICY = (
-    "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data: blob:; worker-src blob:; "
+    "default-src 'none'; script-src '{script}'; style-src '{style}'; img-src data:; worker-src blob:; "
     "base-uri 'none'; form-action 'none'"
 )
 """What the browser lets the page do: run this one script, and reach nothing outside of the file."""
@@ -38,13 +38,15 @@ def write_page(opened: OpenedRun, content: Content) -> bytes:
         opened: The run, of which name, cameras and one picture are shown.
         content: At least one Gaussian.
     """
-    # The first test camera, or the first of all.
+    # It begins at the first test camera, or the first of all.
     cameras = sorted(opened.cameras(), key=lambda one: one.split != "test")
     viewmats = torch.stack([one.camera.viewmat for one in cameras]).double()
     eyes = camera_center(viewmats)
     center = focus(eyes, viewmats[:, 2, :3])
     packed = pack(content, center, max((eyes - center).norm(dim=1).median().item(), 1e-6))
-    constants = RasterConfig()
+    constants = (
+        RasterConfig()
+    )  # a field does not tell its own, which are these unless a run sets raster.*
     about = packed.about | {
         "focus": center.tolist(),
         "up": upright(viewmats).tolist(),
@@ -53,7 +55,6 @@ def write_page(opened: OpenedRun, content: Content) -> bytes:
         "alpha": (constants.alpha_min, constants.alpha_max),
         "margin": constants.fov_margin,
         "cameras": [_camera(one) for one in cameras],
-        "start": 0,
         "heat": _base64(heat(torch.linspace(0, 1, 256)[None]).numpy().tobytes()),
     }
     script = "\n".join((_SOURCES / name).read_text(encoding="utf-8") for name in _SCRIPTS)
@@ -77,14 +78,9 @@ def write_page(opened: OpenedRun, content: Content) -> bytes:
 
 def _note(opened: OpenedRun, content: Content) -> str:
     """What a reader of the page should know."""
-    lines = [
-        "A preview, not what a protocol measures: numbers are rounded to 8 bits"
-        + (
-            ", and every Gaussian is asked for itself where vlgs asks what they blend to."
-            if content.words
-            else "."
-        )
-    ]
+    lines = ["A preview, not what a protocol measures: numbers are rounded."]
+    if content.words:
+        lines.append("Every Gaussian is asked for itself, where vlgs asks what they blend to.")
     lines += [f"{note[0].upper()}{note[1:]}." for note in content.notes]
     if opened.step is not None:
         lines.append(f"Training goes on: this is step {opened.step}.")

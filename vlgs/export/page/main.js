@@ -13,7 +13,7 @@ class Page {
     this.pace = 0; // milliseconds between frames while it moves
     this.share = 1; // of the pixels along an axis, while it moves
     this.step = 0; // its logarithm
-    this.seat(about.start);
+    this.seat(0);
     new ResizeObserver(() => this.show()).observe(this.canvas);
   }
 
@@ -90,7 +90,7 @@ class Page {
     this.show();
   }
 
-  // Ask a word of `about.words` by its place; null: none.
+  // Ask a word of `about.words` by its place; null, or the one that is asked already: none.
   ask(index) {
     this.word = index === this.word ? null : index;
     for (const [i, button] of [...find("words").children].entries()) button.setAttribute("aria-pressed", String(i === this.word));
@@ -152,7 +152,7 @@ function connect(page) {
   const ways = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
   const keys = {
     "+": () => dolly(0.9), "=": () => dolly(0.9), "-": () => dolly(1 / 0.9),
-    "[": () => page.seat(page.camera - 1), "]": () => page.seat(page.camera + 1), r: () => page.seat(about.start),
+    "[": () => page.seat(page.camera - 1), "]": () => page.seat(page.camera + 1), r: () => page.seat(0),
     Escape: () => page.word !== null && page.ask(page.word),
   };
   addEventListener("keydown", (event) => {
@@ -197,12 +197,11 @@ async function start() {
     about,
     // Draws from a camera of vlgs (viewmat 4x4, K 3x3, as lists of rows; width, height), and promises the picture as a data URL.
     look: (camera) => page.look(camera),
-    // Chooses a word by its text, or none with null.
+    // Chooses a word by its text; null: none.
     ask: (word) => {
-      const index = about.words.findIndex(({ name }) => name === word);
-      if (word !== null && index < 0) throw new Error(`no word ${word}`);
-      const wanted = word === null ? page.word : index;
-      if (word === null ? page.word !== null : page.word !== index) page.ask(wanted);
+      const index = word === null ? page.word : about.words.findIndex(({ name }) => name === word);
+      if (index === -1) throw new Error(`no word ${word}`);
+      if (word === null || index !== page.word) page.ask(index);
     },
   };
 }
