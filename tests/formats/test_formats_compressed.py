@@ -148,3 +148,10 @@ def test_convert_writes_it_by_its_suffix(tmp_path: Path):
         "b.compressed.ply: 5 Gaussians as PlayCanvas's compressed PLY, 16 bytes a Gaussian"
     )
     assert len(decoded(tmp_path / "b.compressed.ply")[1]) == 5
+
+
+def test_no_gaussian_is_a_file_without_rows(tmp_path: Path):
+    write_compressed(tmp_path / "a.compressed.ply", some_gaussians(0, 3))
+    lines, gaussians = decoded(tmp_path / "a.compressed.ply")
+    assert gaussians == []
+    assert {"element chunk 0", "element vertex 0", "element sh 0"} <= set(lines)
