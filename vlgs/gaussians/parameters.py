@@ -25,7 +25,7 @@ def activate(params: Parameters, attributes: Attributes = STANDARD) -> Gaussians
     Raises:
         ValueError: If a key is missing.
     """
-    if not _NEEDED <= params.keys():
+    if not params.keys() >= _NEEDED:
         missing = sorted(_NEEDED - params.keys())
         raise ValueError(
             f"gaussians: parameters must have {', '.join(sorted(_NEEDED))}, got no {missing}"
