@@ -13,6 +13,7 @@ from tests.gsplat.dense import Picture, Settings, picture
 from vlgs.gsplat import rasterization
 from vlgs.gsplat.checks import require_opacities, require_shapes
 from vlgs.gsplat.view import compensation
+from vlgs.ops.project import project
 from vlgs.types import Camera, RasterConfig
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -225,8 +226,10 @@ def test_specks_keep_the_digits_of_their_compensation():
     quats, scales = torch.randn(n, 4, generator=rng), 1e-4 * (0.5 + torch.rand(n, 3, generator=rng))
     camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 10], [0, 20, 8], [0, 0, 1]]), 20, 16)
     config = RasterConfig()
-    got = compensation(means, quats, scales, camera, config)
-    want = compensation(means.double(), quats.double(), scales.double(), camera, config)
+    splats = means, quats, scales
+    got = compensation(project(*splats, camera, config), *splats, camera, config)
+    exact = means.double(), quats.double(), scales.double()
+    want = compensation(project(*exact, camera, config), *exact, camera, config)
     torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=0)
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": torch.ones(n)}
     covariance = picture(

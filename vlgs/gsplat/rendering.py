@@ -257,8 +257,12 @@ def _describe(
         "conics": [view.conics for view in views],
         "opacities": [view.opacities for view in views],
     }
-    joined = {k: torch.cat(parts).view(*shape, *parts[0].shape[1:]) for k, parts in figures.items()}
+    joined = {k: _cat(parts).view(*shape, *parts[0].shape[1:]) for k, parts in figures.items()}
     return list(views), Meta(**ids, **joined)
+
+
+def _cat(parts: Sequence[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def _draw(
@@ -274,9 +278,12 @@ def _draw(
         splats = view.splats._replace(mean2d=center)
         groups = [ChannelGroup(view.values, view.opacities)]
         found.append(rasterize_to_pixels(splats, groups, camera, config))
-    return torch.stack([out.images[0] for out in found]), torch.stack(
-        [out.alphas[0] for out in found]
-    )
+    return _stack([out.images[0] for out in found]), _stack([out.alphas[0] for out in found])
+
+
+def _stack(parts: Sequence[Tensor]) -> Tensor:
+    """Along a new first axis; a single image is not copied."""
+    return parts[0][None] if len(parts) == 1 else torch.stack(list(parts))
 
 
 def _in_gsplat_names(message: str) -> str:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from vlgs.geometry import quat_to_rotmat
 from vlgs.ops.depth import camera_depth
 from vlgs.ops.project import Splats, project
 from vlgs.types import Camera, RasterConfig
@@ -74,7 +74,7 @@ def project_view(
     """Project, weaken what is smaller than a pixel if it is asked for, and cull."""
     splats = project(means, quats, scales, camera, config)
     if antialiased:
-        factor = compensation(means, quats, scales, camera, config)
+        factor = compensation(splats, means, quats, scales, camera, config)
         opacities = (opacities * factor).clamp_max(1.0)
     radii = _radii(splats, opacities.detach(), camera, config, culling)
     depth = torch.where(radii[:, 0] > 0, splats.depth, 0)
@@ -100,6 +100,7 @@ def _radii(
 
 
 def compensation(
+    splats: Splats,
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
@@ -108,26 +109,25 @@ def compensation(
 ) -> Float[Tensor, " n"]:
     """Share of its opacity that a Gaussian keeps when it is blurred: sqrt(det S / det(S + eps I)), S its 2D covariance.
 
-    (Yu et al., Mip-Splatting, CVPR 2024, Eq. 9 in two dimensions.) The rows v1, v2 of the projected principal axes give det S as
-    |v1 x v2|^2, which keeps its digits where a Gaussian is far smaller than the blur; what the projection hands on does not.
-    1 where a Gaussian is culled.
+    (Yu et al., Mip-Splatting, CVPR 2024, Eq. 9.) The ellipse gives the second determinant. Not the first: where a Gaussian is far smaller than
+    the blur, a difference of the two has no digits left. With t the clamped slopes x/z and y/z and d = (t, 1) in the Gaussian's own axes,
+    det S = (fx fy / z^2)^2 |(s2 s3, s3 s1, s1 s2) * d|^2, which is the cross product of the projected axes. 1 where a Gaussian is culled.
     """
+    drawn = splats.depth > 0
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     focal, center = K.diagonal()[:2], K[:2, 2]
     size = means.new_tensor([camera.width, camera.height])
     margin = config.fov_margin * size / 2
-    x = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    drawn = (x[:, 2] > config.near) & (quats.norm(dim=1) > 0)
-    x = torch.where(drawn[:, None], x, 1.0)
-    slope = x[:, :2] / x[:, 2:]
-    slope = slope.clamp(-(center + margin) / focal, (size - center + margin) / focal)
-    # Rows of the Jacobian in world axes, [n, 2, 3], then along the principal axes of each Gaussian.
-    rays = viewmat[:2, :3] - slope[..., None] * viewmat[2, :3]
-    rays = rays * (focal / x[:, 2:])[..., None]
+    x = torch.where(drawn[:, None], means @ viewmat[:3, :3].T + viewmat[:3, 3], 1.0)
+    z = x[:, 2:]
+    slope = (x[:, :2] / z).clamp(-(center + margin) / focal, (size - center + margin) / focal)
+    ray = slope @ viewmat[:2, :3] + viewmat[2, :3]
     upright = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    axes = quat_to_rotmat(torch.where(drawn[:, None], quats, upright))
-    v1, v2 = ((rays @ axes) * scales[:, None]).unbind(1)
-    area = torch.linalg.cross(v1, v2).norm(dim=1)
-    trace = v1.square().sum(1) + v2.square().sum(1)
-    blurred = area.square() + config.eps2d * trace + config.eps2d**2
-    return torch.where(drawn, area / blurred.sqrt(), 1.0)
+    unit = normalize(torch.where(drawn[:, None], quats, upright), dim=1, eps=0)
+    w, axis = unit[:, :1], unit[:, 1:]
+    turn = torch.linalg.cross(axis, ray)
+    ray = ray + 2 * (torch.linalg.cross(axis, turn) - w * turn)
+    sides = scales.roll(-1, dims=1) * scales.roll(1, dims=1)
+    area = (sides * ray).norm(dim=1) * (focal.prod() / z.square())[:, 0]
+    inverse = splats.ellipse[:, 0] * splats.ellipse[:, 2]
+    return torch.where(drawn, area * inverse, 1.0)
