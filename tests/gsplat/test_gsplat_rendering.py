@@ -137,6 +137,15 @@ def test_any_scene(
     assert_agree(inputs, chosen, packed)
 
 
+@pytest.mark.parametrize("opacity", [0.9, 0.97, 0.995, 1.0])
+def test_where_light_runs_out_the_last_contribution_is_left_out(opacity: float):
+    """Layers over the whole image, around the largest alpha and the smallest transmittance."""
+    inputs = scene(8, seed=6)
+    inputs["scales"] = inputs["scales"] + 2
+    inputs["opacities"] = torch.full((8,), opacity).double()
+    assert_agree(inputs, Settings(mode="RGB+D"), packed=True)
+
+
 def test_a_batch_is_its_entries():
     entries = [scene(9, seed=i, k=4) for i in range(6)]
     joined = {k: torch.stack([e[k] for e in entries]).unflatten(0, (3, 2)) for k in entries[0]}
