@@ -146,6 +146,28 @@ def test_where_light_runs_out_the_last_contribution_is_left_out(opacity: float):
     assert_agree(inputs, Settings(mode="RGB+D"), packed=True)
 
 
+@pytest.mark.parametrize("packed", [True, False])
+def test_absolute_gradients_are_summed_pixel_by_pixel(packed: bool):
+    inputs, chosen = scene(8, seed=8), Settings(width=9, height=7, mode="RGB+ED")
+    inputs["Ks"][:, :2] *= 0.4
+    inputs["opacities"][:4] = 0.9995  # clamped near the centre
+    images, alphas, meta = drawn(leaves_of(inputs), chosen, packed=packed, absgrad=True)
+    rng = torch.Generator().manual_seed(7)
+    d_image, d_alpha = (torch.randn(t.shape, generator=rng).double() for t in (images, alphas))
+    torch.autograd.backward([images, alphas], [d_image, d_alpha])
+
+    pictures, wanted = dense(leaves_of(inputs), chosen), []
+    for i, p in enumerate(pictures):
+        each = (p.image * d_image[i]).sum(-1) + p.alpha[..., 0] * d_alpha[i, ..., 0]
+        by_pixel = [torch.autograd.grad(x, p.mean2d, retain_graph=True)[0] for x in each.flatten()]
+        wanted.append(torch.stack(by_pixel).abs().sum(0))
+    seen = torch.stack([p.seen for p in pictures])
+    got = meta["means2d"].absgrad
+    assert got.shape == meta["means2d"].shape
+    want = torch.stack(wanted)
+    torch.testing.assert_close(got, want[seen] if packed else want, rtol=1e-7, atol=1e-9)
+
+
 def test_a_batch_is_its_entries():
     entries = [scene(9, seed=i, k=4) for i in range(6)]
     joined = {k: torch.stack([e[k] for e in entries]).unflatten(0, (3, 2)) for k in entries[0]}
@@ -262,7 +284,7 @@ def test_what_is_flat_or_has_no_rotation_has_finite_gradients():
 
 
 @pytest.mark.parametrize("refused", [
-    {"absgrad": True}, {"sparse_grad": True}, {"distributed": True}, {"covars": torch.eye(3)}, {"with_ut": True},
+    {"sparse_grad": True}, {"distributed": True}, {"covars": torch.eye(3)}, {"with_ut": True},
     {"with_eval3d": True}, {"radial_coeffs": torch.zeros(2, 6)}, {"tangential_coeffs": torch.zeros(2, 2)},
     {"thin_prism_coeffs": torch.zeros(2, 4)}, {"ftheta_coeffs": object()}, {"viewmats_rs": torch.eye(4)},
     {"camera_model": "fisheye"}, {"tile_size": 0}, {"eps2d": 0.0}, {"near_plane": 0.0},

@@ -55,15 +55,17 @@ def test_its_strategy_grows_and_prunes_and_the_loss_falls(scene: Scene):
     assert sum(losses[-10:]) < sum(alone[-10:]), "more Gaussians show more"
 
 
+@pytest.mark.parametrize("absgrad", [True, False])
 @pytest.mark.parametrize("packed", [True, False])
-def test_it_gathers_the_gradients_of_the_centres(scene: Scene, packed: bool):
+def test_it_gathers_the_gradients_of_the_centres(scene: Scene, packed: bool, absgrad: bool):
     """Two cameras of 48x36 pixels: the sum over cameras of norms of gradients by units of half images, and how often each is seen."""
-    splats, gathers = start(scene), strategy(refine_scale2d_stop_iter=100)
+    splats, gathers = start(scene), strategy(refine_scale2d_stop_iter=100, absgrad=absgrad)
     state = gathers.initialize_state()
     cameras = [view.camera for view in scene.train[:2]]
     images, _, info = rasterization(
         splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].sigmoid(), splats["sh0"],
         torch.stack([c.viewmat for c in cameras]), torch.stack([c.K for c in cameras]), 48, 36, sh_degree=0, packed=packed,
+        absgrad=absgrad,
     )  # fmt: skip
     gathers.step_pre_backward(splats, {}, state, 0, info)
     images.square().mean().backward()
@@ -72,7 +74,8 @@ def test_it_gathers_the_gradients_of_the_centres(scene: Scene, packed: bool):
     want, count = torch.zeros(2, len(splats["means"]))
     radii = torch.zeros_like(want)
     ids = info["gaussian_ids"] if packed else torch.arange(len(want)).repeat(2)
-    grads, boxes = info["means2d"].grad.view(-1, 2), info["radii"].view(-1, 2)
+    centers, boxes = info["means2d"], info["radii"].view(-1, 2)
+    grads = (centers.absgrad if absgrad else centers.grad).view(-1, 2)
     for row, (dx, dy), box in zip(ids.tolist(), grads.tolist(), boxes.tolist(), strict=True):
         if min(box) > 0:
             want[row] += ((dx * 48 / 2 * 2) ** 2 + (dy * 36 / 2 * 2) ** 2) ** 0.5

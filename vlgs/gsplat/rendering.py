@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from vlgs.gaussians.sh import sh_to_rgb
 from vlgs.geometry import camera_center
+from vlgs.gsplat.absgrad import watch
 from vlgs.gsplat.checks import (
     refuse,
     require_one_of,
@@ -90,7 +91,8 @@ def rasterization(
     * No gradient reaches `viewmats` and ``meta["conics"]``; spherical harmonics go to degree 3.
     * `packed` decides about ``meta`` alone; memory is the same. `tile_size`, `channel_chunk` and `segmented` change nothing that is drawn.
     * gsplat's lists of tiles (``tiles_per_gauss``, ``isect_ids``, ``flatten_ids``, ``isect_offsets``) are not in ``meta``.
-    * Refused by name: `absgrad`, `sparse_grad`, `distributed`, `covars`, `with_ut`, `with_eval3d`, distorted lenses, rolling shutters, and every `camera_model`
+    * `absgrad` is exact and slow (`vlgs.gsplat.absgrad`); ``meta["means2d"].absgrad`` is there, zero, before the backward pass.
+    * Refused by name: `sparse_grad`, `distributed`, `covars`, `with_ut`, `with_eval3d`, distorted lenses, rolling shutters, and every `camera_model`
       but ``pinhole``.
 
     Args:
@@ -113,7 +115,7 @@ def rasterization(
         backgrounds: What is seen where nothing lies; depth has none.
         render_mode: Colours, sum_i w_i z_i (``D``), the same by the accumulated weight (``ED``), or two of them: depth is the last channel.
         sparse_grad: Must be False.
-        absgrad: Must be False.
+        absgrad: Whether a backward pass writes ``meta["means2d"].absgrad``, the sums over pixels of the sizes of gradients (AbsGS).
         rasterize_mode: ``antialiased`` makes Gaussians fainter by what the blur of `eps2d` widens them (Mip-Splatting).
         channel_chunk: Without effect.
         distributed: Must be False.
@@ -143,7 +145,7 @@ def rasterization(
         (torch.Size([1, 3, 4, 3]), torch.Size([1, 3, 4, 1]), tensor([[3, 3]], dtype=torch.int32))
     """
     refuse(
-        absgrad=absgrad, sparse_grad=sparse_grad, distributed=distributed, covars=covars,
+        sparse_grad=sparse_grad, distributed=distributed, covars=covars,
         with_ut=with_ut, with_eval3d=with_eval3d, radial_coeffs=radial_coeffs,
         tangential_coeffs=tangential_coeffs, thin_prism_coeffs=thin_prism_coeffs,
         ftheta_coeffs=ftheta_coeffs, viewmats_rs=viewmats_rs,
@@ -174,7 +176,7 @@ def rasterization(
         shades = _shades(colors, sh_degree, parts[0], cameras, batch)
         views = [_with_values(*pair, render_mode) for pair in zip(views, shades, strict=True)]
         views, meta = _describe(views, batch, c, packed)
-        images, alphas = _draw(views, meta["means2d"], cameras, config)
+        images, alphas = _draw(views, meta["means2d"], cameras, config, absgrad)
     except ValueError as error:
         raise ValueError(_in_gsplat_names(str(error))) from error
     images = images.view(*batch, c, *images.shape[1:])
@@ -270,15 +272,27 @@ def _draw(
     means2d: Float[Tensor, "*shape 2"],
     cameras: Sequence[Camera],
     config: RasterConfig,
+    absgrad: bool,
 ) -> tuple[Float[Tensor, "i h w x"], Float[Tensor, "i h w"]]:
     """Blend every image, with the centres that stand in `Meta`, so that their gradient is gathered there."""
-    centers = means2d.view(-1, 2).split([len(view.radii) for view in views])
-    found = []
-    for view, center, camera in zip(views, centers, cameras, strict=True):
+    counts = [len(view.radii) for view in views]
+    sizes = torch.zeros_like(means2d) if absgrad else means2d.detach()
+    if absgrad:
+        means2d.absgrad = sizes  # pyright: ignore[reportAttributeAccessIssue] (gsplat's name and place)
+    images, alphas = [], []
+    for view, center, size, camera in zip(
+        views, means2d.view(-1, 2).split(counts), sizes.view(-1, 2).split(counts), cameras, strict=True
+    ):  # fmt: skip
         splats = view.splats._replace(mean2d=center)
-        groups = [ChannelGroup(view.values, view.opacities)]
-        found.append(rasterize_to_pixels(splats, groups, camera, config))
-    return _stack([out.images[0] for out in found]), _stack([out.alphas[0] for out in found])
+        out = rasterize_to_pixels(
+            splats, [ChannelGroup(view.values, view.opacities)], camera, config
+        )
+        image, alpha = out.images[0], out.alphas[0]
+        if absgrad:
+            image, alpha = watch(out, view, camera, config, size)
+        images.append(image)
+        alphas.append(alpha)
+    return _stack(images), _stack(alphas)
 
 
 def _stack(parts: Sequence[Tensor]) -> Tensor:

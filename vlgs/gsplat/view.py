@@ -54,6 +54,11 @@ class ViewSplats:
             xx = x * x
             return torch.stack([xx, -xx * slope, xx * slope * slope + y * y], dim=1)
 
+    def detach(self) -> "ViewSplats":
+        """The same numbers, from which no gradient can be asked."""
+        rest = (self.radii, self.depths, self.opacities, self.values)
+        return ViewSplats(Splats(*(t.detach() for t in self.splats)), *(t.detach() for t in rest))
+
     def rows(self, index: Tensor) -> "ViewSplats":
         """Some of the Gaussians."""
         splats = Splats(*(t[index] for t in self.splats))
