@@ -164,6 +164,10 @@ def test_absolute_gradients_are_summed_pixel_by_pixel(packed: bool):
     seen = torch.stack([p.seen for p in pictures])
     got = meta["means2d"].absgrad
     assert got.shape == meta["means2d"].shape
+    empty = {k: t if k in ("viewmats", "Ks", "backgrounds") else t[:0] for k, t in inputs.items()}
+    nothing = drawn(leaves_of(empty), chosen, packed=packed, absgrad=True)
+    nothing[0].sum().backward()
+    assert nothing[2]["means2d"].absgrad.numel() == 0
     want = torch.stack(wanted)
     torch.testing.assert_close(got, want[seen] if packed else want, rtol=1e-7, atol=1e-9)
 

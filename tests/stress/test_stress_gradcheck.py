@@ -143,6 +143,7 @@ NO_GRADIENT = {
     "vlgs.ops.rasterize_to_pixels.weights_alone": "the constants of a CachedView",
     "vlgs.ops.depth.median_rows": "picks rows",
     "vlgs.gsplat.example.draw": "goes through what is checked",
+    "vlgs.gsplat.example.valid": "a mask",
     "vlgs.gsplat.view.ViewSplats.rows": "picks rows",
     "vlgs.gsplat.view.ViewSplats.detach": "takes the gradient away",
     "vlgs.gsplat.absgrad.watch": "hands on what it gets (tests/gsplat)",

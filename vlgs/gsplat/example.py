@@ -12,16 +12,12 @@ from vlgs.gaussians.neighbors import mean_squared_distance
 from vlgs.geometry import scene_extent
 from vlgs.gsplat import rasterization
 from vlgs.losses import l1_dssim
-from vlgs.types import Camera, Scene
+from vlgs.types import Camera, Scene, View
 
 RATES = {
-    "means": 1.6e-4,
-    "scales": 5e-3,
-    "quats": 1e-3,
-    "opacities": 5e-2,
-    "sh0": 2.5e-3,
-    "shN": 1.25e-4,
-}
+    "means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4,
+}  # fmt: skip
+"""Those of 3DGS; that of the means is in units of the scene."""
 
 
 def start(scene: Scene) -> ParameterDict:
@@ -45,12 +41,16 @@ def draw(splats: ParameterDict, camera: Camera, degree: int) -> tuple[torch.Tens
     return image[0], info
 
 
+def valid(view: View) -> torch.Tensor:
+    """The pixels that a photograph covers; undistortion leaves borders."""
+    size = view.camera.height, view.camera.width
+    return view.read_valid() if view.read_valid else torch.ones(size, dtype=torch.bool)
+
+
 def train(scene: Scene, steps: int, strategy: Any = None) -> tuple[ParameterDict, list[float]]:
     """Gaussians and the loss of every step; a strategy of gsplat decides how many Gaussians there are."""
-    splats, extent = (
-        start(scene),
-        scene_extent(torch.stack([v.camera.viewmat for v in scene.train])),
-    )
+    splats = start(scene)
+    extent = scene_extent(torch.stack([view.camera.viewmat for view in scene.train]))
     rates = RATES | {"means": RATES["means"] * extent}
     optimizers = {k: torch.optim.Adam([splats[k]], lr=rate, eps=1e-15) for k, rate in rates.items()}
     state = strategy.initialize_state(scene_scale=extent) if strategy else {}
@@ -60,8 +60,7 @@ def train(scene: Scene, steps: int, strategy: Any = None) -> tuple[ParameterDict
         image, info = draw(splats, view.camera, degree=min(step // 500, 3))
         if strategy:
             strategy.step_pre_backward(splats, optimizers, state, step, info)
-        valid = view.read_valid() if view.read_valid else None
-        loss = l1_dssim(image, view.read_image() / 255, valid)
+        loss = l1_dssim(image, view.read_image() / 255, valid(view))
         loss.backward()
         losses.append(loss.item())
         for optimizer in optimizers.values():
@@ -99,8 +98,11 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.write("no densification: that takes gsplat (pip install gsplat==1.5.3)\n")
     splats, _ = train(scene, given.steps, strategy)
     with torch.no_grad():
-        pairs = [(draw(splats, v.camera, 3)[0], v.read_image() / 255) for v in scene.test]
-    psnr = torch.stack([-10 * (a - b).square().mean().log10() for a, b in pairs]).mean()
+        errors = [
+            (draw(splats, view.camera, 3)[0] - view.read_image() / 255)[valid(view)].square().mean()
+            for view in scene.test
+        ]
+    psnr = -10 * torch.stack(errors).log10().mean()
     sys.stdout.write(f"{len(splats['means'])} Gaussians, PSNR of held-out views {psnr:.2f} dB\n")
 
 

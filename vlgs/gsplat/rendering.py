@@ -76,7 +76,7 @@ def rasterization(
 
     The image model is that of gsplat 1.5.3: alpha is at most 0.999, contributions below 1/255 are left out, a pixel ends before the
     contribution that would bring its transmittance to 1e-4, and the Jacobian of the projection is clamped 0.3 half images outside of the
-    image. What is drawn is exactly that; gsplat's kernel does the same arithmetic in another order.
+    image. tests/gsplat/dense.py writes it down in plain torch, and every mode is compared with that.
 
     ``meta`` has what gsplat's strategies and trainers read: ``means2d`` (between projecting and blending, so that after ``retain_grad()`` its
     gradient is that of the loss by pixels), ``radii``, ``depths``, ``conics``, ``opacities``, ``batch_ids``, ``camera_ids`` and ``gaussian_ids`` (None unless
@@ -105,7 +105,7 @@ def rasterization(
         Ks: Pinhole intrinsics in pixels, without skew.
         width: Pixels.
         height: Pixels.
-        near_plane: Nothing nearer is drawn, world units.
+        near_plane: Nothing nearer is drawn, world units; above 0.
         far_plane: Nothing farther is drawn, world units.
         radius_clip: Gaussians whose radii are no larger are not drawn, pixels.
         eps2d: Added to the diagonal of 2D covariances, pixel^2; above 0.
