@@ -11,7 +11,19 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from vlgs.identity import AS_WITHOUT
-from vlgs.known import CONF, groups, is_ours, join, last, nodes, option, renamed, targets, unread
+from vlgs.known import (
+    CONF,
+    chosen,
+    groups,
+    is_ours,
+    join,
+    last,
+    nodes,
+    option,
+    renamed,
+    targets,
+    unread,
+)
 
 FORMER_CLASSES: Mapping[str, str] = {
     "ColourOpacity": "Opacity",
@@ -39,14 +51,18 @@ def as_today(recorded: DictConfig) -> DictConfig:
             _set_target(key, node)
     for key, _ in list(unread(plain)):
         _drop(plain, key)
-    chosen, foreign = _options(plain)
+    options, foreign = _options(plain)
+    always = chosen()  # any other group has to be added
+    asked = [f"{'' if g in always else '+'}{g}={name}" for g, name in options.items()]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", [f"{group}={name}" for group, name in chosen.items()])
+        config = compose("config", asked)
     OmegaConf.set_struct(config, False)
     for group in foreign:
         config[group] = {}  # the arguments of the default are not its own
     for key, value in AS_WITHOUT.items():
-        if value is not True and key not in before:
+        above = key.rpartition(".")[0]
+        there = not above or OmegaConf.select(config, above) is not None
+        if value is not True and key not in before and there:
             OmegaConf.update(config, key, value)
     merged = OmegaConf.merge(config, plain)
     assert isinstance(merged, DictConfig)

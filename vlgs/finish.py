@@ -1,11 +1,14 @@
 """Everything that a run does after its last step: scores, pictures, point clouds, and the metrics that mark it as finished."""
 
+import logging
 import resource
 from dataclasses import asdict, replace
 from typing import Any
 
+from vlgs.fields import Field
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.identity import RESULTS_VERSION
+from vlgs.opened.files import write_field
 from vlgs.prepare import Prepared
 from vlgs.query import Learning, TextEncoder
 from vlgs.report.evaluate import evaluate, prompts_of
@@ -14,9 +17,12 @@ from vlgs.report.provenance import commit, machine
 from vlgs.report.results import write_metrics, write_queries
 from vlgs.report.timing import measure_fps
 from vlgs.report.words import questions_of
+from vlgs.runs import RunFolder
 from vlgs.training.separate import without_language
 from vlgs.training.stages import Progress
 from vlgs.training.workshop import Workshop, all_skips
+
+log = logging.getLogger(__name__)
 
 
 def report(
@@ -84,5 +90,14 @@ def report(
         **asdict(timing),
     }
     folder.require_own()
+    _keep(folder, field, experiment.parts.trainer.iterations)
     write_queries(folder.queries, evaluation)
     return write_metrics(folder.metrics, evaluation, extra)
+
+
+def _keep(folder: RunFolder, field: Field, step: int) -> None:
+    """Keep the field for those who open the run; one of a user's own kind stays with the checkpoints."""
+    try:
+        write_field(folder, field, step)
+    except ValueError as error:
+        log.warning("%s; vlgs.query, render, view and export cannot open this run", error)

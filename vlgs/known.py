@@ -232,13 +232,23 @@ def _unread_in(key: str, node: Any) -> Iterator[tuple[str, list[str]]]:
 
 
 @cache
+def chosen(name: str = "config") -> frozenset[str]:
+    """Groups of which a primary file always chooses an option.
+
+    Example:
+        >>> "fusion" in chosen(), "lift" in chosen()
+        (True, False)
+    """
+    entries = contents(CONF / f"{name}.yaml")["defaults"]
+    found = {str(group) for entry in entries if isinstance(entry, dict) for group in entry}
+    return frozenset(group for group in found if not group.startswith("override "))
+
+
+@cache
 def _top(name: str) -> frozenset[str]:
-    content = contents(CONF / f"{name}.yaml")
-    chosen = {str(g) for entry in content["defaults"] if isinstance(entry, dict) for g in entry}
-    chosen = {group for group in chosen if not group.startswith("override ")}
-    kept = set(content) - {"defaults", "hydra"}
+    kept = set(contents(CONF / f"{name}.yaml")) - {"defaults", "hydra"}
     brought = {"features", "lift"}  # by augment=offline_sam and method=lift
-    return frozenset(kept | chosen | brought)
+    return frozenset(kept | chosen(name) | brought)
 
 
 @cache

@@ -108,7 +108,7 @@ def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, FloatingPointError):
-        begun = {".lock", folder.config.name}
+        begun = {".lock", folder.config.name, folder.scene.name}
         if folder.curves.is_file() and folder.curves.read_bytes().count(b"\n") <= 1:
             begun.add(folder.curves.name)  # the heads of its columns alone
         if folder.path.is_dir() and all(path.name in begun for path in folder.path.iterdir()):
@@ -126,6 +126,7 @@ def _run_in(folder: RunFolder, ready: "Prepared") -> int:
         return _say(finished, folder, "already done, nothing computed")
     from vlgs.data.scene_warnings import plausibility_warnings
     from vlgs.finish import report
+    from vlgs.opened.files import write_scene
     from vlgs.prepare import doubts, make_workshop, text_encoder
     from vlgs.training.stages import run_stages
     from vlgs.training.workshop import StoppedError
@@ -136,6 +137,7 @@ def _run_in(folder: RunFolder, ready: "Prepared") -> int:
         log.warning("warning: %s", doubt)
     text = text_encoder(experiment, scene)
     write_config(folder.config, experiment.record)
+    write_scene(folder, scene, list(ready.scenes))
     workshop = make_workshop(folder, ready)
     try:
         progress = run_stages(experiment.stages(), ready.scenes, workshop)

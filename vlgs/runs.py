@@ -1,6 +1,7 @@
 """Run folders: where the files of a run are, and the lock that lets one process write them. Imports no torch.
 
-    <results>/runs/<run id>/  config.yaml  metrics.json  queries.json  log.csv  checkpoint/  renders/  point_cloud.ply
+    <results>/runs/<run id>/  config.yaml  scene.safetensors  log.csv  checkpoint/
+                              metrics.json  queries.json  renders/  point_cloud.ply  field.safetensors
 
 `metrics.json` is written last: a folder that has it is a finished run.
 """
@@ -66,6 +67,16 @@ class RunFolder:
     def metrics(self) -> Path:
         """Results; its presence says that the run is finished."""
         return self.path / "metrics.json"
+
+    @property
+    def scene(self) -> Path:
+        """Cameras and words of the scene, from the start of the run (`vlgs.opened.files`)."""
+        return self.path / "scene.safetensors"
+
+    @property
+    def field(self) -> Path:
+        """The trained scene, from its end."""
+        return self.path / "field.safetensors"
 
     @property
     def queries(self) -> Path:

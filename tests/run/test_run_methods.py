@@ -17,6 +17,7 @@ from vlgs.fields import Field, HasGaussians
 from vlgs.files import write_atomically
 from vlgs.known import options
 from vlgs.manual import list_options
+from vlgs.opened import open_run
 from vlgs.run import run
 from vlgs.runs import RunFolder
 from vlgs.training.checkpoint import load_checkpoint
@@ -108,6 +109,7 @@ def test_it_trains_stops_goes_on_and_comes_back(tmp_path: Path, runner: Runner, 
     assert len(parts.written) < len(whole.written), "what was made is not made again"
     require_same(parts, whole)
 
+    require_opened(whole)
     whole.folder.metrics.unlink()
     back = runner(tmp_path / "whole", chosen)
     assert not back.written
@@ -162,6 +164,27 @@ def require_field(ran: Ran) -> None:
         assert torch.isfinite(each).all()
         for weight in (field.opacities(), field.language_weights()):
             assert ((weight >= 0) & (weight <= 1)).all()
+
+
+def require_opened(ran: Ran) -> None:
+    """The folder alone gives the same field, to the bit, and knows where the photographs were taken."""
+    opened = open_run(ran.folder.path)
+    views = [*ran.scene.train, *ran.scene.test]
+    assert [one.name for one in opened.cameras()] == [view.name for view in views]
+    camera = opened.cameras("test")[0].camera
+    kept, first = opened.field, ran.field
+    assert isinstance(kept, HasGaussians) == isinstance(first, HasGaussians)
+    assert (kept.outputs, len(kept.levels())) == (first.outputs, len(first.levels()))
+    one, other = kept.render(camera, kept.outputs), first.render(camera, first.outputs)
+    for name in kept.outputs:
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+    if not kept.has_language:
+        with pytest.raises(ValueError, match="made to show colour alone"):
+            opened.ask(["mug"])
+        return
+    asked = opened.ask(ran.scene.classes[:1])
+    words = torch.randn(2, asked.prompts.text.shape[1])  # no class's, which a method may have moved
+    assert torch.equal(kept.similarity(camera, words), first.similarity(camera, words))
 
 
 def require_same(one: Ran, other: Ran) -> None:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.extras import require_extra
 from vlgs.types import Vocabulary
 
 CLIP_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -105,6 +106,7 @@ class ClipText:
 
     def _load(self) -> tuple[Any, Any]:
         if self._loaded is None:
+            require_extra("transformers", "features")
             from transformers import AutoModel, AutoTokenizer  # 2.6 s, and an optional dependency
 
             try:

@@ -44,19 +44,28 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     Raises:
         OSError: If the disk is full or read-only; the previous checkpoint is then untouched.
     """
-    from safetensors.torch import save
-
     folder.mkdir(parents=True, exist_ok=True)
-    tensors = {key: value.detach().contiguous() for key, value in checkpoint.tensors.items()}
-    step, meta = str(checkpoint.step), json.dumps(checkpoint.meta)
-    header = {"format": FORMAT, "step": step, "meta": meta, "digest": _digest(step, meta, tensors)}
-    # One entry, because safetensors writes several in random order: equal checkpoints are equal bytes.
-    data = save(tensors, {"vlgs": json.dumps(header)})
     path = folder / f"step_{checkpoint.step:08d}.safetensors"
-    write_atomically(path, data)
+    write_atomically(path, encode(checkpoint))
     with suppress(OSError):
         keep_from(folder, checkpoint.step)
     return path
+
+
+def encode(checkpoint: Checkpoint, form: str = FORMAT) -> bytes:
+    """The content of a file: tensors, meta and a digest of both; equal checkpoints are equal bytes.
+
+    Args:
+        checkpoint: Step, tensors and JSON values.
+        form: Name and version of what they mean.
+    """
+    from safetensors.torch import save
+
+    tensors = {key: value.detach().contiguous() for key, value in checkpoint.tensors.items()}
+    step, meta = str(checkpoint.step), json.dumps(checkpoint.meta)
+    header = {"format": form, "step": step, "meta": meta, "digest": _digest(step, meta, tensors)}
+    # One entry, because safetensors writes several in random order.
+    return save(tensors, {"vlgs": json.dumps(header)})
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
@@ -69,7 +78,7 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
     candidates = _candidates(folder)
     for path in candidates:
         try:
-            checkpoint = _read(path)
+            checkpoint = decode(path)
         except (ValueError, OSError) as error:
             problems.append(f"{path.name} {error}")
             continue
@@ -108,8 +117,13 @@ def _step(path: Path) -> int:
     return int(match[1])
 
 
-def _read(path: Path) -> Checkpoint:
-    """Raises ValueError, with what follows the file's name in a sentence."""
+def decode(path: Path, form: str = FORMAT) -> Checkpoint:
+    """Read what `encode` wrote.
+
+    Raises:
+        ValueError: If it is something else or damaged, with what follows the file's name in a sentence.
+        OSError: If it cannot be read.
+    """
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -123,19 +137,20 @@ def _read(path: Path) -> Checkpoint:
     try:
         header = json.loads(outer["vlgs"]) if "vlgs" in outer else outer
         written, step, meta = header["format"], header["step"], header["meta"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        content = json.loads(meta)
+    except (json.JSONDecodeError, KeyError, TypeError, RecursionError) as error:
         raise ValueError("has no header of format, step and meta") from error
-    if written == FORMAT:
+    if written == form:
         sound = header.get("digest") == _digest(step, meta, tensors)
-    elif written == FIRST_FORMAT:
+    elif written == FIRST_FORMAT and form == FORMAT:
         sound = (
             _first_digest(path) == hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
         )
     else:
-        raise ValueError(f"must have format {FORMAT}, got {written}")
+        raise ValueError(f"must have format {form}, got {written!r:.80}")
     if not sound:
         raise ValueError("does not match its digest")
-    return Checkpoint(int(step), tensors, json.loads(meta))
+    return Checkpoint(int(step), tensors, content)
 
 
 def _digest(step: str, meta: str, tensors: Mapping[str, Tensor]) -> str:

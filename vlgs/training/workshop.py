@@ -6,9 +6,10 @@ A finished model is loaded from its checkpoint, so that the same command continu
 import logging
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from vlgs.fields import Field
+from vlgs.fields.saved import plan_of_model
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.runs import RunFolder
@@ -115,7 +116,7 @@ class Workshop:
         if name:
             log.info("model %s of this run, in %s", name, folder.path)
         module = self._build(scene, change(self.make_parts()), start, color)
-        stopped_by = fit(module, folder, self.make_options())
+        stopped_by = fit(module, folder, self._options(module, color or start is not None))
         require_done(module, stopped_by, name)
         return self._remember(name, module, color or start is not None, kept)
 
@@ -141,8 +142,14 @@ class Workshop:
         module.next_step = module.settings.iterations
         module.train_seconds = time.perf_counter() - started
         folder.require_own()
-        save_checkpoint(folder.checkpoint, capture(module, self.make_options().meta))
+        save_checkpoint(folder.checkpoint, capture(module, self._options(module, True).meta))
         return self._remember(name, module)
+
+    def _options(self, module: VLGSModule, color: bool) -> FitOptions:
+        """With what a checkpoint says of the field that it holds, so that a training can be looked at (`vlgs.opened`)."""
+        options = self.make_options()
+        plan = plan_of_model(module.model, color, module.views.has_language)
+        return replace(options, meta={**options.meta, "plan": plan})
 
     def _build(
         self, scene: Scene, parts: Parts, start: SplatModel | None, color: bool = True

@@ -1,0 +1,152 @@
+"""Opens a run folder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from vlgs.config import check_targets, instantiate
+from vlgs.earlier import as_today
+from vlgs.fields import NO_LANGUAGE, Field
+from vlgs.fields.saved import MakePart
+from vlgs.opened.files import NamedCamera, SceneNotes, field_of, read_field, read_scene
+from vlgs.opened.words import Words
+from vlgs.places import found_again
+from vlgs.query import Query, Questions
+from vlgs.runs import RunFolder
+from vlgs.training.checkpoint import load_checkpoint
+
+_FREE = frozenset({"vlgs.fusion.none.NoFusion", "vlgs.indicator.Learned"})
+"""What a model may have in place of what the configuration chooses: nothing that takes an argument."""
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """A trained scene that can be asked, drawn and shown."""
+
+    path: Path
+    """The run folder."""
+    field: Field
+    notes: SceneNotes
+    query: Query
+    """How relevancy is computed."""
+    words: Words
+    """What gives words their vectors."""
+    step: int | None
+    """How far a run is that still trains; None: it is finished."""
+
+    def cameras(self, split: str | None = None) -> Sequence[NamedCamera]:
+        """Where photographs were taken: of one split, ``train`` or ``test``, or all."""
+        return [one for one in self.notes.cameras if split in (None, one.split)]
+
+    def held_out(self) -> Sequence[NamedCamera]:
+        """Cameras of held-out photographs; where there are none, all."""
+        return self.cameras("test") or self.cameras()
+
+    def place(self, level: int) -> int:
+        """Place of a mask level among those of the field.
+
+        Raises:
+            ValueError: If the run has no such level.
+        """
+        if level not in self.notes.levels:
+            known = (
+                ", ".join(map(str, self.notes.levels))
+                if self.notes.levels[0] is not None
+                else "none"
+            )
+            raise ValueError(f"{self.path}: level must be one of the run's, {known}, got {level}")
+        return self.notes.levels.index(level)
+
+    def ask(self, words: Sequence[str]) -> Questions:
+        """Words together with all that a query needs for them.
+
+        A run whose vocabulary lacks the words that its query compares with has its words compete with each other: the note says so.
+
+        Raises:
+            ValueError: If there is no word, one cannot be encoded, or the run knows no language.
+            OSError: If weights are missing.
+        """
+        if not self.field.has_language:
+            raise ValueError(f"{self.path}: cannot be asked for words, {NO_LANGUAGE}")
+        return self.words.ask(self.query, words)
+
+
+def open_run(
+    folder: Path | str,
+    vocabulary: Path | None = None,
+    text: str | None = None,
+    template: str = "{}",
+) -> OpenedRun:
+    """Open the folder of a run, finished or still training.
+
+    Args:
+        folder: ``<results>/runs/<run id>``.
+        vocabulary: A file of further words and vectors (`vlgs.vocabulary` makes one).
+        text: Name or folder of a CLIP or SigLIP whose text tower encodes what no vocabulary has; None: that of the run, if it had one.
+        template: Sentence around words that a text tower encodes.
+
+    Raises:
+        ValueError: If it is no run folder, has nothing to show yet, or is of another version.
+        OSError: If a file cannot be read.
+    """
+    path = Path(folder)
+    run = RunFolder(path)
+    if not run.config.is_file():
+        raise ValueError(f"{path}: must be the folder of a run, with config.yaml in it, got none")
+    config = _config(path)
+    notes = read_scene(run)
+    field, step = _field(run, partial(_make, config))
+    known = Words.of(notes.vocabulary, config.text, vocabulary, text, template)
+    return OpenedRun(path, field, notes, instantiate(config.query), known, step)
+
+
+def _config(path: Path) -> DictConfig:
+    try:
+        config = as_today(found_again(path.resolve()))
+        check_targets(config, plugins=())  # a file's word is nobody's trust
+    except (OmegaConfBaseException, UnicodeDecodeError, AssertionError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(
+            f"{path}/config.yaml: must be that of a run, got: {reason:.200}"
+        ) from error
+    return config
+
+
+def _field(run: RunFolder, make: MakePart) -> tuple[Field, int | None]:
+    """The field that was kept in the end; before that the one of the newest checkpoint that describes one."""
+    if run.field.is_file():
+        return read_field(run, make), None
+    found = sorted(run.path.rglob("step_*.safetensors"), key=lambda file: file.stat().st_mtime_ns)
+    for folder in dict.fromkeys(file.parent for file in reversed(found)):
+        checkpoint = load_checkpoint(folder)
+        if checkpoint is not None and "plan" in checkpoint.meta:
+            return field_of(checkpoint, make, "model."), checkpoint.step
+    raise ValueError(
+        f"{run.path}: must have a trained scene ({run.field.name}) or a checkpoint of Gaussians, got neither; the run's command goes on with it"
+    )
+
+
+def _make(config: DictConfig, group: str, path: str) -> Any:
+    """A part of a model: that of the configuration, or one that needs no configuration.
+
+    Raises:
+        ValueError: If a file asks for something else.
+    """
+    node = config.get(group)
+    if node is not None and _home(str(node._target_)) == path:
+        return instantiate(node)
+    if path not in _FREE:
+        raise ValueError(f"{group} must be that of config.yaml, got {path!r:.80}")
+    return instantiate(OmegaConf.create({"_target_": path}))
+
+
+def _home(target: str) -> str:
+    """Where a class is defined."""
+    made = get_object(target)
+    return f"{made.__module__}.{made.__qualname__}"
