@@ -114,7 +114,7 @@ def compensation(
 ) -> Float[Tensor, " n"]:
     """Share of its opacity that a Gaussian keeps when it is blurred: sqrt(det S / det(S + eps I)), S its 2D covariance.
 
-    (Yu et al., Mip-Splatting, CVPR 2024, Eq. 9.) The ellipse gives the second determinant. Not the first: where a Gaussian is far smaller than
+    This is the 2D filter of Mip-Splatting (Yu et al., CVPR 2024). The ellipse gives the second determinant. Not the first: where a Gaussian is far smaller than
     the blur, a difference of the two has no digits left. With t the clamped slopes x/z and y/z and d = (t, 1) in the Gaussian's own axes,
     det S = (fx fy / z^2)^2 |(s2 s3, s3 s1, s1 s2) * d|^2, which is the cross product of the projected axes. 1 where a Gaussian is culled.
     """
