@@ -121,6 +121,7 @@ NO_GRADIENT = {
         "HasGaussians.gaussian_similarity", "HasGaussians.render_values",
     )},
     "vlgs.fields.gaussians_of": "returns its argument",
+    "vlgs.fields.saved.take_apart": "of what is trained",
     "vlgs.fields.planes.PlaneField.similarity": "training is over",
     **{f"vlgs.fields.planes.PlaneGaussians.{name}": "training is over" for name in (
         "opacities", "language_weights", "gaussian_similarity", "render_values",
