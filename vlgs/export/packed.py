@@ -31,7 +31,7 @@ _RARE = 1e-3
 """Share of colours at each end that may be clipped: a few very bright ones would take the steps of all others."""
 
 _HARMONIC_STEPS = 8
-"""To each side of 0. Of glassware's pictures 15 change 66 dB and take 29 bytes a Gaussian in the page, 127 change 73 dB and take 48."""
+"""To each side of 0. With 8 the pictures of a trained glassware keep 62 dB and degree 3 takes 23 bytes a Gaussian in the page; with 127, 73 dB and 48."""
 
 
 @dataclass(frozen=True)
@@ -68,17 +68,15 @@ def pack(content: Content, center: Float[Tensor, " 3"], unit: float) -> Packed:
     further = params["shN"].flatten(1)
     reach = _quantile(further.abs(), 1 - _RARE) if further.numel() else 0.0
     if reach > 0:
-        steps = (further / reach * _HARMONIC_STEPS).round().clamp(-_HARMONIC_STEPS, _HARMONIC_STEPS)
-        columns["harmonics"] = (steps + _HARMONIC_STEPS).to(torch.uint8)
-    words: list[dict[str, Any]] = []
+        steps = (further / reach * _HARMONIC_STEPS).round()
+        steps = steps.clamp(-_HARMONIC_STEPS, _HARMONIC_STEPS) + _HARMONIC_STEPS
+        columns["harmonics"] = steps.to(torch.uint8)
+    ends = [_ends(word.relevancy) for word in content.words]
     if content.words:
         columns["weights"] = _bytes(torch.stack(list(content.weights), dim=1), 0.0, 1.0)
-        ends = [_ends(word.relevancy) for word in content.words]
-        answers = zip(content.words, ends, strict=True)
-        columns["relevancy"] = torch.cat(
-            [_bytes(word.relevancy[:, None], *own_ends) for word, own_ends in answers], dim=1
-        )
-        words = [_word(word, own_ends) for word, own_ends in zip(content.words, ends, strict=True)]
+        asked = zip(content.words, ends, strict=True)
+        answers = [_bytes(word.relevancy[:, None], *own_ends) for word, own_ends in asked]
+        columns["relevancy"] = torch.cat(answers, dim=1)
     if own and content.words:
         columns["language_scales"] = _bytes(params["language_log_scales"], *scales)
         columns["language_quats"] = _turns(params["language_quats"])
@@ -89,7 +87,7 @@ def pack(content: Content, center: Float[Tensor, " 3"], unit: float) -> Packed:
         "scales": {"low": scales[0], "high": scales[1]},
         "color": color,
         "harmonics": (-reach, reach * (255 / _HARMONIC_STEPS - 1)),  # what 0 and 255 stand for
-        "words": words,
+        "words": [_word(*pair) for pair in zip(content.words, ends, strict=True)],
     }
     raw = b"".join(column.T.contiguous().numpy().tobytes() for column in columns.values())
     return Packed(gzip.compress(raw, mtime=0), about)
