@@ -75,6 +75,16 @@ def test_several_mask_levels_come_back(tmp_path: Path, levels: str):
     assert opened.place(2) == 1
 
 
+def test_colour_and_language_apart_come_back(tmp_path: Path):
+    config = composed(*TINY, "trainer=smoke", "trainer.iterations=6", "sharing=none", "fusion=none", "pictures=false", f"results={tmp_path}")  # fmt: skip
+    assert run(config) == 0
+    opened = open_run(next((tmp_path / "runs").iterdir()))
+    seen = opened.field.render(opened.cameras()[0].camera, frozenset({"color", "feature"}))
+    assert seen.color is not None
+    assert seen.color.any()
+    assert opened.ask(["mug"]).prompts.names == ("mug",)
+
+
 def test_planes_that_a_query_learned_come_back(folder: Path, opened: OpenedRun):
     words = torch.eye(512)[:2]
     planes = [Plane(torch.randn(512), 0.25), Plane(torch.randn(512), -1.5)]

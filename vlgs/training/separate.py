@@ -74,7 +74,7 @@ def unite(color: SplatModel, language: SplatModel) -> SplatModel:
         language.head,
         color.raster,
         color.sh_degree,
-        attributes=language.attributes,
+        attributes={**language.attributes, "shN": color.attributes["shN"]},
     )
     model.splats = nn.ParameterDict({k: nn.Parameter(v, False) for k, v in both.items()})
     return model
