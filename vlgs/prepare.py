@@ -11,7 +11,7 @@ import torch
 
 from vlgs.data.diagnostics import Fault, warning
 from vlgs.experiment import Experiment, Scenes
-from vlgs.formats import file_digest
+from vlgs.formats import file_digest, folder_digest
 from vlgs.heads import FittedHead
 from vlgs.ops.rasterize import check_config as check_constants
 from vlgs.query import TextEncoder, encode_questions, words_of
@@ -69,6 +69,7 @@ def prepare(experiment: Experiment) -> Prepared:
         experiment.method.require(scenes)
     read = [ready.fingerprint, experiment.augment.identity()]
     read += [file_digest(path, key) for key, path in experiment.given_files.items()]
+    read += [folder_digest(path, key) for key, path in experiment.given_folders.items()]
     return replace(ready, run_id=experiment.run_id(" ".join(filter(None, read))))
 
 

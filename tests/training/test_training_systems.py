@@ -21,7 +21,9 @@ from vlgs.training.build import Parts, build_module, scaled
 from vlgs.training.checkpoint import load_checkpoint
 from vlgs.training.fit import FitOptions
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.separate import without_language
 from vlgs.training.stages import Progress, run_stages
+from vlgs.training.state import capture, restore
 from vlgs.training.workshop import Workshop
 from vlgs.types import Scene, View
 
@@ -170,3 +172,22 @@ def test_feature_3dgs_loss_is_that_of_decoded_pixels(gaps: Scene, pixels: str):
         over = there.sum() if pixels == "valid" else there.numel()
         term = done.terms[f"language {place}"].detach()
         assert float(term) == pytest.approx(float(error.detach().sum() / over), rel=1e-4)
+
+
+def test_colour_alone_carries_no_codes_that_nothing_reads(tiny_scene: Scene):
+    """Codes of the method's width come with the stage that has language, at zero as before."""
+    parts = construct(composed("method=lift")).parts
+    geometry = build_module(without_language(tiny_scene), parts, seed=0)
+    assert geometry.model.splats["features"].shape[1] == 1
+    assert geometry.model.levels == 1
+    lifted = build_module(tiny_scene, parts, 0, start=dict(geometry.model.splats))
+    assert lifted.model.splats["features"].shape[1] == 512
+    assert not lifted.model.splats["features"].any()
+    # A checkpoint of before has codes of zeros.
+    saved = capture(geometry, {})
+    wide = saved.tensors | {"model.splats.features": torch.zeros(geometry.count, 512)}
+    restore(geometry, replace(saved, tensors=wide))
+    assert geometry.model.splats["features"].shape[1] == 1
+    drawn = replace(parts, gaussians=replace(parts.gaussians, init_features="normal"))
+    kept = build_module(without_language(tiny_scene), drawn, seed=0)
+    assert kept.model.splats["features"].shape[1] == 512, "a later stage goes on from these"

@@ -116,7 +116,7 @@ def _splats_together(plan: Plan, tensors: Tensors, make: MakePart) -> SplatField
         raw, fusion, indicator, head, raster, degree, bool(plan["evaluated"]), attributes
     )
     _load(model, {k: v for k, v in tensors.items() if k.partition(".")[0] in ("splats", *_CHOSEN)})
-    if model.splats["features"].shape[1] % head.dim:
+    if plan["language"] and model.splats["features"].shape[1] % head.dim:
         raise ValueError(
             f"{_WHO}: features must be as wide as codes of {head.dim}, or several of them, got {model.splats['features'].shape[1]}"
         )

@@ -97,8 +97,8 @@ class SplatModel(nn.Module):
 
     @property
     def levels(self) -> int:
-        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``."""
-        return self.splats["features"].shape[1] // self.head.dim
+        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``, and 1 where colour alone keeps no whole code."""
+        return max(1, self.splats["features"].shape[1] // self.head.dim)
 
     def gaussians(self) -> Gaussians:
         """The Gaussians in natural units."""

@@ -103,8 +103,10 @@ def build_module(
         # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
         config = replace(config, prune_on="opacity")
-    width = head.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
+    # Colour alone has codes only if they come with the Gaussians or are drawn: a later stage goes on from these.
+    given = config.init is not None or config.init_features == "normal"
+    width = head.dim * scene.mask_levels if language or given else 1
     own = language and parts.sharing.own_shape
     several = has(parts.indicator, "each_level") and scene.mask_levels > 1
     levels = scene.mask_levels if several else None
