@@ -60,7 +60,9 @@ def as_today(recorded: DictConfig) -> DictConfig:
     for group in foreign:
         config[group] = {}  # the arguments of the default are not its own
     for key, value in AS_WITHOUT.items():
-        if value is not True and key not in before:
+        above, _, name = key.rpartition(".")
+        there = name in (OmegaConf.select(config, above) if above else config)
+        if there and value is not True and key not in before:
             OmegaConf.update(config, key, value)
     merged = OmegaConf.merge(config, plain)
     assert isinstance(merged, DictConfig)

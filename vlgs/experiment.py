@@ -128,7 +128,7 @@ def construct(config: DictConfig) -> Experiment:
         run_id=partial(run_id, config),
     )
     chosen = {field.name: getattr(parts, field.name) for field in fields(Parts)}
-    for key in ("augment", "levels", "method"):
+    for key in ("augment", "levels", "method", "query"):
         chosen[key] = getattr(experiment, key)
     chosen |= {f"loss.{name}": objective for name, objective in parts.loss.items()}
     for demand in unmet(chosen):

@@ -62,7 +62,7 @@ PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "scen
 GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
-GIVEN_FOLDERS = frozenset({"stages.second.folder"})
+GIVEN_FOLDERS = frozenset({"query.masks", "stages.second.folder"})
 """Keys, without the numbers of lists, that name a folder of files to learn from: likewise."""
 
 AS_WITHOUT: Mapping[str, Any] = {
@@ -72,6 +72,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
+    "query.masks": None,
     "stages": None,
     "trainer.exposure": False,
     "trainer.language_decay": 1,

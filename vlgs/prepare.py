@@ -14,7 +14,7 @@ from vlgs.experiment import Experiment, Scenes
 from vlgs.formats import file_digest, folder_digest
 from vlgs.heads import FittedHead
 from vlgs.ops.rasterize import check_config as check_constants
-from vlgs.query import TextEncoder, encode_questions, words_of
+from vlgs.query import Particular, TextEncoder, encode_questions, words_of
 from vlgs.query.text import VocabularyText
 from vlgs.report.evaluate import evaluate
 from vlgs.runs import RunFolder
@@ -92,7 +92,8 @@ def text_encoder(experiment: Experiment, scene: Scene) -> TextEncoder | None:
     """The text encoder for the scene's words; None if there is nothing to ask.
 
     Raises:
-        ValueError: If a class or a negative is a word that it does not know: an error now, not after training.
+        ValueError: If a class or a negative is a word that it does not know, or the query cannot learn what it means: an error now, not
+            after training.
     """
     if scene.mask_vectors.shape[0] == 0:
         return None
@@ -109,6 +110,8 @@ def text_encoder(experiment: Experiment, scene: Scene) -> TextEncoder | None:
         )
         return None
     encode_questions(query, text, scene)
+    if isinstance(query, Particular) and scene.classes:
+        query.require(scene, scene.classes)
     return text
 
 

@@ -44,7 +44,7 @@ NAMES = {
     "gaussians": "default",
     "indicator": "fixed learned opacity per_level",
     "protocol": "auto dense lerf_ovs mipnerf360_goi ovs3d_argmax ovs3d_threshold select3d",
-    "query": "hyperplane lerf_relevancy vocab_softmax",
+    "query": "hyperplane lerf_relevancy objects vocab_softmax",
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vlgs.types import Camera
@@ -108,6 +108,24 @@ class HasGaussians(Protocol):
         Args:
             cameras: Where colours count, at least one; the training cameras.
         """
+        ...
+
+
+@runtime_checkable
+class HasObjects(Protocol):
+    """What a field of one mask level also answers that tells objects apart, which have numbers from 0."""
+
+    @property
+    def object_count(self) -> int:
+        """How many there are; 0: it knows none."""
+        ...
+
+    def objects(self, camera: Camera) -> Int[Tensor, "h w"]:
+        """The likeliest object of each pixel; `object_count` where it is none."""
+        ...
+
+    def with_objects(self, words: Float[Tensor, "k e"], chosen: Bool[Tensor, "k objects"]) -> Field:
+        """The same field, whose score of these words is the probability of the objects that are chosen for each."""
         ...
 
 
