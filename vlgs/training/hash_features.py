@@ -142,7 +142,7 @@ class HashLearner(Learner):
             (splats.splats["means"].detach() - self.frame.center) * self.frame.scale
         )
         self.seen = [index for index, view in enumerate(scene.train) if view.read_masks is not None]
-        self._views = CachedViews(settings.skip.frozen_budget)
+        self._views = CachedViews(settings.skip.kept_bytes)
         self._rows: dict[int, Tensor] = {}
         self._seconds: dict[int, Tensor] = {}
 

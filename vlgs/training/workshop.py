@@ -118,6 +118,7 @@ class Workshop:
         module = self._build(scene, change(self.make_parts()), start, color)
         stopped_by = fit(module, folder, self._options(module, color or start is not None))
         require_done(module, stopped_by, name)
+        module.step.frozen = None  # weights of views: what comes after training needs the memory
         return self._remember(name, module, color or start is not None, kept)
 
     def lift(
