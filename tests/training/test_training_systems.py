@@ -177,7 +177,9 @@ def test_feature_3dgs_loss_is_that_of_decoded_pixels(gaps: Scene, pixels: str):
 def test_colour_alone_carries_no_codes_that_nothing_reads(tiny_scene: Scene):
     """Codes of the method's width come with the stage that has language, at zero as before."""
     parts = construct(composed("method=lift")).parts
-    geometry = build_module(without_language(tiny_scene), parts, seed=0)
+    silent = without_language(tiny_scene)
+    assert build_module(silent, parts, seed=0).model.splats["features"].shape[1] == 512
+    geometry = build_module(silent, parts, seed=0, codes=False)
     assert geometry.model.splats["features"].shape[1] == 1
     assert geometry.model.levels == 1
     lifted = build_module(tiny_scene, parts, 0, start=dict(geometry.model.splats))
@@ -189,5 +191,5 @@ def test_colour_alone_carries_no_codes_that_nothing_reads(tiny_scene: Scene):
     restore(geometry, replace(saved, tensors=wide))
     assert geometry.model.splats["features"].shape[1] == 1
     drawn = replace(parts, gaussians=replace(parts.gaussians, init_features="normal"))
-    kept = build_module(without_language(tiny_scene), drawn, seed=0)
+    kept = build_module(silent, drawn, seed=0, codes=False)
     assert kept.model.splats["features"].shape[1] == 512, "a later stage goes on from these"

@@ -97,7 +97,7 @@ class SplatModel(nn.Module):
 
     @property
     def levels(self) -> int:
-        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``, and 1 where colour alone keeps no whole code."""
+        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``, and 1 where a stage of colour alone leaves codes out."""
         return max(1, self.splats["features"].shape[1] // self.head.dim)
 
     def gaussians(self) -> Gaussians:

@@ -261,7 +261,7 @@ class TrainColor:
         """See `Stage`."""
         scene = without_language(next(iter(progress.scenes.values())))
         change = partial(scaled, share=self.share)
-        trained = workshop.train(self.name, scene, change, kept=self.kept)
+        trained = workshop.train(self.name, scene, change, kept=self.kept, codes=self.kept)
         model = SplatField(trained.model, language=False)
         return progress.having(self.name, {None: model})
 
