@@ -19,6 +19,7 @@ from vlgs.data.colmap import load_scene, survey
 from vlgs.data.diagnostics import Fault, SceneError, errors, listing, warning
 from vlgs.data.scene_warnings import plausibility_warnings
 from vlgs.data.source import ColmapSource
+from vlgs.demands import has
 from vlgs.experiment import Experiment, construct
 from vlgs.prepare import doubts, prepare, rehearse
 from vlgs.text import screen
@@ -67,7 +68,7 @@ def start(config: DictConfig, report: Report) -> Report:
         experiment = construct(config)
         if not errors(report.faults):
             line, doubtful = training_memory(experiment)
-            summary.append(line)
+            summary += filter(None, [line])
             found += [*doubtful, *doubts(experiment)]
             rehearse(prepare(experiment))
     except SceneError as error:
@@ -162,8 +163,11 @@ def summarize(scene: Scene) -> Iterator[str]:
 def training_memory(experiment: Experiment) -> tuple[str, tuple[Fault, ...]]:
     """Memory that a run with this configuration may need for its Gaussians: a line of the summary, and a warning if it is too much.
 
-    Value, gradient and Adam's two moments of every parameter at `gaussians.max_count`; images and activations come on top.
+    Value, gradient and Adam's two moments of every parameter at `gaussians.max_count`; images and activations come on top. The line is empty
+    where a method has no Gaussians.
     """
+    if has(experiment.method, "without_gaussians"):
+        return "", ()
     gaussians, head = experiment.parts.gaussians, experiment.parts.head
     geometry, weights = 3 + 4 + 3, 2  # means, quats, scales; opacity and indicator
     parameters = geometry + weights + 3 * (gaussians.sh_degree + 1) ** 2

@@ -60,9 +60,9 @@ def as_today(recorded: DictConfig) -> DictConfig:
     for group in foreign:
         config[group] = {}  # the arguments of the default are not its own
     for key, value in AS_WITHOUT.items():
-        above = key.rpartition(".")[0]
-        there = not above or OmegaConf.select(config, above) is not None
-        if value is not True and key not in before and there:
+        above, _, name = key.rpartition(".")
+        beside = OmegaConf.select(config, above) if above else config
+        if value is not True and key not in before and beside is not None and name in beside:
             OmegaConf.update(config, key, value)
     merged = OmegaConf.merge(config, plain)
     assert isinstance(merged, DictConfig)

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from vlgs.config import instantiate
 from vlgs.demands import Demand, has, unmet
-from vlgs.identity import GIVEN_FILES, RunIdentity, identity, run_id
+from vlgs.identity import GIVEN_FILES, RunIdentity, given_folders, identity, run_id
 from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.places import record
@@ -58,6 +58,8 @@ class Experiment:
     """The data's own mask level."""
     given_files: Mapping[str, str]
     """Dotted key -> file to start from."""
+    given_folders: Mapping[str, str]
+    """Dotted key -> folder of files to learn from."""
     seed: int
     threads: int
     results: Path
@@ -113,6 +115,7 @@ def construct(config: DictConfig) -> Experiment:
         read_scene=partial(instantiate, config.data),
         level=config.data.get("level"),
         given_files=_given_files(config),
+        given_folders=given_folders(config),
         seed=config.seed,
         threads=config.threads,
         results=Path(config.results),
@@ -125,7 +128,7 @@ def construct(config: DictConfig) -> Experiment:
         run_id=partial(run_id, config),
     )
     chosen = {field.name: getattr(parts, field.name) for field in fields(Parts)}
-    for key in ("augment", "levels", "method"):
+    for key in ("augment", "levels", "method", "query"):
         chosen[key] = getattr(experiment, key)
     chosen |= {f"loss.{name}": objective for name, objective in parts.loss.items()}
     for demand in unmet(chosen):

@@ -3,11 +3,14 @@
 import logging
 import resource
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
+from vlgs.experiment import Experiment
 from vlgs.fields import Field
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.identity import RESULTS_VERSION
+from vlgs.known import option
 from vlgs.opened.files import write_field
 from vlgs.prepare import Prepared
 from vlgs.query import Learning, TextEncoder
@@ -72,6 +75,7 @@ def report(
         "n_gaussians": sum(made.gaussians for made in workshop.kept),
         "levels": [level for level in ready.scenes if level is not None] if language else [],
         "level_models": experiment.level_models,
+        "query": _query(experiment) if language else None,
         "train_seconds": sum(made.seconds for made in workshop.made.values()),
         "skips": all_skips(workshop.made.values()).report(),
         "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
@@ -93,6 +97,13 @@ def report(
     _keep(folder, field, experiment.parts.trainer.iterations)
     write_queries(folder.queries, evaluation)
     return write_metrics(folder.metrics, evaluation, extra)
+
+
+def _query(experiment: Experiment) -> str:
+    """How words were asked, and whose masks taught what they mean where these were given."""
+    said = experiment.record["query"]
+    name = option("query", said["_target_"]) or said["_target_"]
+    return f"{name}, masks of {Path(said['masks']).name}" if said.get("masks") else name
 
 
 def _keep(folder: RunFolder, field: Field, step: int) -> None:

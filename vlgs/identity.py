@@ -25,7 +25,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from vlgs.known import OPEN, former, is_group, join, last, option, targets
+from vlgs.known import OPEN, former, is_group, join, last, nodes, option, targets
 
 RESULTS_VERSION = 6
 """Part of every run id; raised by a change that can move a number."""
@@ -62,6 +62,9 @@ PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "scen
 GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
+GIVEN_FOLDERS = frozenset({"query.masks", "stages.second.folder"})
+"""Keys, without the numbers of lists, that name a folder of files to learn from: likewise."""
+
 AS_WITHOUT: Mapping[str, Any] = {
     "data.faults.shared": 0,
     "gaussians.background": 0,
@@ -70,6 +73,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
+    "query.masks": None,
     "stages": None,
     "trainer.exposure": False,
     "trainer.language_decay": 1,
@@ -102,11 +106,19 @@ def identity(config: DictConfig) -> RunIdentity:
     plain = _plain(config)
     data, seed = plain.pop("data"), plain.pop("seed")
     given = {former(".".join(key)): (plain.get(key[0]) or {}).get(key[1]) for key in GIVEN_FILES}
+    given |= given_folders(config)
     names = {key: Path(str(path)).name for key, path in given.items() if path is not None}
     read = {key: value for key, value in data.items() if key not in PLACES}
     return RunIdentity(
         _digest(_without_files(plain) | names), _digest(_counted(read, "data")), seed
     )
+
+
+def given_folders(config: DictConfig) -> dict[str, str]:
+    """Dotted key -> folder, of all `GIVEN_FOLDERS` that a configuration names."""
+    every = nodes(_plain(config))
+    found = {join(key, name): value for key, node in every for name, value in node.items()}
+    return {key: str(path) for key, path in found.items() if path and _bare(key) in GIVEN_FOLDERS}
 
 
 def moves(key: str) -> bool:
@@ -142,6 +154,8 @@ def _counted(node: Any, key: str = "") -> dict[str, Any]:
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
     if key in MOVES_NOTHING:
         return
+    if key in GIVEN_FOLDERS:
+        node = None if node is None else True  # what is in it counts
     if not isinstance(node, Mapping):
         yield key, _value(node, key)
         return
@@ -180,6 +194,10 @@ def _own_folders() -> list[Path]:
         return []
     sources = HydraConfig.get().runtime.config_sources
     return [Path(source.path) for source in sources if source.provider == "command-line"]
+
+
+def _bare(key: str) -> str:
+    return ".".join(name for name in key.split(".") if not name.isdigit())
 
 
 def _digest(content: Mapping[str, Any]) -> str:

@@ -11,10 +11,10 @@ import torch
 
 from vlgs.data.diagnostics import Fault, warning
 from vlgs.experiment import Experiment, Scenes
-from vlgs.formats import file_digest
+from vlgs.formats import file_digest, folder_digest
 from vlgs.heads import FittedHead
 from vlgs.ops.rasterize import check_config as check_constants
-from vlgs.query import TextEncoder, encode_questions, words_of
+from vlgs.query import Particular, TextEncoder, encode_questions, words_of
 from vlgs.query.text import VocabularyText
 from vlgs.report.evaluate import evaluate
 from vlgs.runs import RunFolder
@@ -69,6 +69,7 @@ def prepare(experiment: Experiment) -> Prepared:
         experiment.method.require(scenes)
     read = [ready.fingerprint, experiment.augment.identity()]
     read += [file_digest(path, key) for key, path in experiment.given_files.items()]
+    read += [folder_digest(path, key) for key, path in experiment.given_folders.items()]
     return replace(ready, run_id=experiment.run_id(" ".join(filter(None, read))))
 
 
@@ -91,7 +92,8 @@ def text_encoder(experiment: Experiment, scene: Scene) -> TextEncoder | None:
     """The text encoder for the scene's words; None if there is nothing to ask.
 
     Raises:
-        ValueError: If a class or a negative is a word that it does not know: an error now, not after training.
+        ValueError: If a class or a negative is a word that it does not know, or the query cannot learn what it means: an error now, not
+            after training.
     """
     if scene.mask_vectors.shape[0] == 0:
         return None
@@ -108,6 +110,8 @@ def text_encoder(experiment: Experiment, scene: Scene) -> TextEncoder | None:
         )
         return None
     encode_questions(query, text, scene)
+    if isinstance(query, Particular) and scene.classes:
+        query.require(scene, scene.classes)
     return text
 
 

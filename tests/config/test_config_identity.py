@@ -14,7 +14,15 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from tiny_runs import composed
 
-from vlgs.identity import AS_WITHOUT, MOVES_NOTHING, PLACES, identity, moves, run_id
+from vlgs.identity import (
+    AS_WITHOUT,
+    MOVES_NOTHING,
+    PLACES,
+    given_folders,
+    identity,
+    moves,
+    run_id,
+)
 from vlgs.known import CONF, contents, groups, is_group, last, nodes, option, options, targets
 
 MOVING_NOTHING = (
@@ -36,7 +44,7 @@ NAMES = {
     "gaussians": "default",
     "indicator": "fixed learned opacity per_level",
     "protocol": "auto dense lerf_ovs mipnerf360_goi ovs3d_argmax ovs3d_threshold select3d",
-    "query": "hyperplane lerf_relevancy vocab_softmax",
+    "query": "hyperplane lerf_relevancy objects vocab_softmax",
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
@@ -247,3 +255,17 @@ def test_an_option_of_a_folder_of_ones_own_has_its_name_unless_ours_has_it(tmp_p
         ValueError, match=r"named by one file.*gated\.yaml and wide\.yaml.*defaults: \[gated"
     ):
         option("fusion", "my_lab.Gated", [tmp_path])
+
+
+def test_a_folder_of_second_maps_counts_by_its_content_and_not_by_its_place():
+    def ids(*folder: str) -> tuple[str, str]:
+        config = composed("method=fmgs", *(f"stages.1.second.folder={path}" for path in folder))
+        return run_id(config, "content"), identity(config).recipe
+
+    without, here, there, other = ids(), ids("here/dino"), ids("/there/dino"), ids("here/edges")
+    assert without == ("a50fa9bf3f4c990d", "6369ef7f639e3755")
+    assert here == there != without
+    assert here[0] == other[0], "the content stands in the fingerprint"
+    assert here[1] != other[1], "a table tells them apart by their names"
+    given = given_folders(composed("method=fmgs", "stages.1.second.folder=/there/dino"))
+    assert given == {"stages.1.second.folder": "/there/dino"}

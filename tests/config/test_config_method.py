@@ -9,7 +9,7 @@ from tiny_runs import TINY, composed
 from vlgs.config import check_config
 from vlgs.experiment import construct
 from vlgs.identity import identity
-from vlgs.known import option
+from vlgs.known import option, options
 from vlgs.run import run
 from vlgs.runs import RunFolder
 from vlgs.training.checkpoint import load_checkpoint
@@ -97,6 +97,8 @@ def test_a_method_runs(chosen, tmp_path: Path):
         (["method=gs3d", "fusion=self"], "fusion must be none with a method of colour alone, as there is no language, got self"),
         (["method=gs3d", "indicator=learned"], "indicator must be fixed or opacity with a method of colour alone"),
         (["method=goi", "head=autoencoder"], "head must be lookup with loss.lookup, as it learns the rows of a table, got autoencoder"),
+        (["method=lerf", "augment=offline"], "augment must be none with a radiance field, as there are no Gaussians to render .*, got offline$"),
+        (["method=opennerf", "levels=separate"], "levels must be single or joint with a radiance field, as there is one field .*, got separate$"),
         (["stages=[3]"], "config: stages must be a list of stages, got"),
         (["stages=[{_target_: vlgs.training.stages.Train, start: shape}]"], r"earlier stage \(none\), got 'shape'"),
         (["stages=[{_target_: vlgs.training.stages.Train, name: ../up}]"], r"name must be of small letters.*got '../up'"),
@@ -114,6 +116,20 @@ def test_what_no_method_can_be_is_refused(chosen, overrides: list[str], message:
 
     with pytest.raises(ValueError, match=message):
         refuse()
+
+
+@pytest.mark.parametrize("method", options("method"))
+def test_the_budget_of_the_released_programs_goes_with_every_method(method: str):
+    config = composed(f"method={method}", "trainer=released")
+    check_config(config)
+    trainer, densify = (construct(config).parts.trainer, config.gaussians.densify)
+    assert trainer.iterations == 15000
+    assert densify.grad_threshold == 2e-4
+    rates, released = config.trainer.learning_rates, composed("trainer=released").trainer
+    own = {"features"}  # a method may say how fast its codes learn
+    assert {k: v for k, v in rates.items() if k not in own} == {
+        k: v for k, v in released.learning_rates.items() if k not in own
+    }
 
 
 def test_two_stages_of_one_name_are_refused():

@@ -136,6 +136,9 @@ def test_memory_of_a_run_is_told_and_doubted():
     assert not found
     _, found = training_memory(construct(composed("gaussians.max_count=1000000000")))
     assert "Gaussians should take at most half of the memory" in str(found[0])
+    for method in ("lerf", "opennerf"):  # they have none
+        assert training_memory(construct(composed(f"method={method}"))) == ("", ())
+    assert training_memory(construct(composed("method=fmgs")))[0]
 
 
 def test_a_sound_scene_gives_no_doubt(tiny_scene: Scene):

@@ -17,6 +17,7 @@ from vlgs.formats import (
     FORMATS,
     Imported,
     file_digest,
+    folder_digest,
     read_gaussians,
     start_from,
     write_gaussians,
@@ -24,6 +25,7 @@ from vlgs.formats import (
 from vlgs.formats.plain import load_plain
 from vlgs.gaussians import STANDARD, attributes_of, read_ply, write_ply
 from vlgs.gaussians.config import GaussiansConfig
+from vlgs.gaussians.ply import PLAIN
 
 PARAMETERS = tuple(STANDARD)[:8]
 """What every training has."""
@@ -359,3 +361,45 @@ def test_a_run_starts_from_any_of_these(tmp_path: Path):
     write_ply(tmp_path / "empty.ply", random_params(0))
     with pytest.raises(ValueError, match="must hold Gaussians, got none"):
         start_from(tmp_path / "empty.ply", attributes_of(GaussiansConfig(), 3))
+
+
+def test_weights_of_a_codebook_come_back_as_they_were_drawn(tmp_path: Path):
+    """A point cloud has codes after activation; a training that activates them once more would flatten them."""
+    config = GaussiansConfig(codes="sparse", codes_kept=2)
+    row = attributes_of(config, 10, parts=2)["features"]
+    params = random_params(5)
+    weights = row.activate(3 * torch.randn(5, 10, generator=torch.Generator().manual_seed(0)))
+    write_ply(tmp_path / "drawn.ply", params | {"features": weights}, notes=(PLAIN,))
+    started = start_from(tmp_path / "drawn.ply", attributes_of(config, 10, parts=2))["features"]
+    torch.testing.assert_close(row.activate(started), weights, rtol=1e-6, atol=1e-7)
+    assert (row.activate(started) > 0).sum() == 5 * 2 * 2
+    assert not row.activate(weights).allclose(weights, atol=0.05)
+    for codes in (
+        -weights,
+        weights * 1.1,
+        torch.full((5, 10), 0.2),
+        weights * (torch.arange(10) > 4),
+    ):
+        write_ply(tmp_path / "other.ply", params | {"features": codes}, notes=(PLAIN,))
+        with pytest.raises(
+            ValueError, match=r"weights of at most 2 entries .* in 5 of 5 Gaussians"
+        ):
+            start_from(tmp_path / "other.ply", attributes_of(config, 10, parts=2))
+    write_ply(tmp_path / "none.ply", params | {"features": 0 * weights}, notes=(PLAIN,))
+    without = start_from(tmp_path / "none.ply", attributes_of(config, 10, parts=2))["features"]
+    assert not without.any(), "a file without language starts as any other"
+
+
+def test_a_folder_counts_by_what_is_in_it(tmp_path: Path):
+    for place in ("a", "b"):
+        (tmp_path / place / "deep").mkdir(parents=True)
+        (tmp_path / place / "one").write_bytes(b"1")
+        (tmp_path / place / "deep" / "two").write_bytes(b"2")
+    first = folder_digest(tmp_path / "a", "maps")
+    assert folder_digest(tmp_path / "b", "maps") == first
+    (tmp_path / "b" / "deep" / "two").write_bytes(b"3")
+    assert folder_digest(tmp_path / "b", "maps") != first
+    (tmp_path / "a" / "one").rename(tmp_path / "a" / "three")
+    assert folder_digest(tmp_path / "a", "maps") != first
+    with pytest.raises(FileNotFoundError, match="run: maps must be a folder, got"):
+        folder_digest(tmp_path / "none", "maps")

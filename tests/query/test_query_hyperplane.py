@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from vlgs.fields import Field, FieldImages
 from vlgs.fields.similarity import cosines
-from vlgs.query import Hyperplane, Learning, Prompts, Query
+from vlgs.query import Hyperplane, Learning, Particular, Prompts, Query
 from vlgs.query.hyperplane import hinge_slope
 from vlgs.types import Scene
 
@@ -89,6 +91,25 @@ def test_a_field_answers_by_the_planes_of_its_words(tiny_scene: Scene):
     torch.testing.assert_close(answer[0, :1], field.similarity(camera, other[None])[0])
     (level,) = learned.levels()
     torch.testing.assert_close(level.similarity(camera, word[None]), answer[:, 1:])
+
+
+def test_a_plane_learns_from_a_picture_of_the_user(tmp_path: Path, tiny_scene: Scene):
+    """The word is that of one mask, and the picture shows another: it is the picture that counts."""
+    field, scene = Painted(tiny_scene), replace(tiny_scene, train=tiny_scene.train[:1])
+    rows, counts = field.masks[field.masks >= 0].unique(return_counts=True)
+    own, shown = rows[counts.argsort(descending=True)][:2].tolist()
+    word, mask, view = tiny_scene.mask_vectors[own], field.masks == shown, scene.train[0]
+    (tmp_path / "it").mkdir()
+    picture = Image.fromarray((255 * mask).byte().numpy())
+    picture.save(tmp_path / "it" / f"{view.name}.png")
+    query = Hyperplane(masks=str(tmp_path))
+    assert isinstance(query, Particular)
+    prompts = Prompts(("it",), word[None], torch.zeros(0, len(word)))
+    learned = query.learn(field, scene, prompts)  # pyright: ignore[reportArgumentType]
+    chosen = learned.similarity(view.camera, word[None])[0, 0] > 0
+    assert (chosen & mask).sum() >= 0.9 * (chosen | mask).sum()
+    with pytest.raises(ValueError, match=r"masks .* must have <word>/<view>\.png"):
+        query.require(scene, ["mug"])
 
 
 def test_bad_values_are_named():

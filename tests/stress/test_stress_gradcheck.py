@@ -121,15 +121,20 @@ NO_GRADIENT = {
         "HasGaussians.gaussian_similarity", "HasGaussians.render_values",
     )},
     "vlgs.fields.gaussians_of": "returns its argument",
-    "vlgs.fields.saved.take_apart": "of what is trained",
+    "vlgs.fields.saved.take_apart": "training is over",
     "vlgs.fields.planes.PlaneField.similarity": "training is over",
     **{f"vlgs.fields.planes.PlaneGaussians.{name}": "training is over" for name in (
         "opacities", "language_weights", "gaussian_similarity", "render_values",
     )},
-    **{f"vlgs.query.hyperplane.Hyperplane.{name}": "training is over" for name in ("relevancy", "__call__")},
+    **{f"vlgs.query.{query}.{name}": "training is over" for query in ("hyperplane.Hyperplane", "objects.Objects")
+       for name in ("relevancy", "__call__")},
     "vlgs.query.hyperplane.hinge_slope": "a gradient itself",
     **{f"vlgs.fields.trained.SplatField.{name}": "training is over" for name in (
         "similarity", "opacities", "language_weights", "gaussian_similarity", "render_values",
+    )},
+    **{f"vlgs.fields.{name}.objects": "a number of an object" for name in ("HasObjects", "trained.SplatField")},
+    **{f"vlgs.query.{name}": "a choice" for name in (
+        "objects.choose_objects", "view_masks.MaskFolder.find", "view_masks.OwnMasks.find",
     )},
     "vlgs.fields.several.SeveralFields.similarity": "training is over",
     "vlgs.fields.splat.ViewRender.detach": "takes the gradient away",

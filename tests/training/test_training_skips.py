@@ -3,6 +3,7 @@
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ import torch
 from tiny_runs import TINY, composed
 from torch import Tensor
 
+import vlgs.training.workshop
 from vlgs.config import instantiate
+from vlgs.experiment import construct
+from vlgs.fields.splat import FusedGaussians
 from vlgs.gaussians import write_ply
 from vlgs.geometry import camera_center
 from vlgs.objectives import Language
@@ -19,9 +23,12 @@ from vlgs.runs import RunFolder
 from vlgs.skip_count import WORK, SkipCount
 from vlgs.skips import SKIPS
 from vlgs.training.build import Parts, build_module
+from vlgs.training.cached_renders import CachedRenders
 from vlgs.training.fit import FitOptions, fit
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.settings import OTHERS, SkipConfig
 from vlgs.training.state import capture, restore
+from vlgs.training.workshop import Workshop
 from vlgs.types import Camera, Scene
 from vlgs.view_blend import BetaBlend, blend_camera
 
@@ -208,6 +215,61 @@ def test_views_beyond_the_budget_are_rendered_in_full(tiny_scene: Scene, tmp_pat
     module = module_of(tiny_scene, *FROZEN["language alone"], "trainer.skip.frozen_budget=1000")
     assert train(module, tmp_path).next_step == 12
     assert "frozen_weights" not in module.skips.skipped
+
+
+def test_which_views_are_kept_does_not_depend_on_their_order(
+    tiny_scene: Scene, caplog: pytest.LogCaptureFixture
+):
+    """Or a resumed run, whose first views are others, would have other bits."""
+    module = module_of(tiny_scene, *FROZEN["opacity"])
+    cameras, fused = [view.camera for view in tiny_scene.train], module.model.fuse()
+    whole = CachedRenders(module.model, cameras, 1 << 30, SkipCount())
+    assert all(_rendered(whole, index, fused) for index in range(len(cameras)))
+    sizes = [
+        view.nbytes
+        for view in (whole.views.get((i, "opacity")) for i in range(len(cameras)))
+        if view
+    ]
+    for kept in (0, 1, 4):
+        for order in (range(len(cameras)), reversed(range(len(cameras)))):
+            caplog.clear()
+            with caplog.at_level("INFO"):
+                renders = CachedRenders(
+                    module.model, cameras, sum(sizes[: kept + 1]) - 1, SkipCount()
+                )
+                found = {index for index in order if _rendered(renders, index, fused)}
+            assert found == set(range(kept))
+            assert renders.views.used <= renders.views.budget
+            assert caplog.messages[0].startswith(
+                f"frozen weights: of {kept} of {len(cameras)} views"
+            )
+
+
+def _rendered(renders: CachedRenders, index: int, fused: FusedGaussians) -> bool:
+    return renders.render(index, renders.cameras[index], True, True, fused) is not None
+
+
+def test_kept_weights_go_when_training_ends(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    modules: list[VLGSModule] = []
+
+    def fitting(module: VLGSModule, *rest: Any) -> str | None:
+        modules.append(module)
+        return fit(module, *rest)
+
+    monkeypatch.setattr(vlgs.training.workshop, "fit", fitting)
+    chosen = (*TINY, "trainer=smoke", "trainer.iterations=2", "gaussians.densify.stop=0")
+    parts = construct(composed(*chosen, *FROZEN["opacity"])).make_parts
+    options = FitOptions(meta={}, progress=False)
+    Workshop(RunFolder(tmp_path), parts, lambda: options, 0).train("", tiny_scene)
+    assert modules[0].skips.done("weights") > 0
+    assert modules[0].step.frozen is None
+
+
+def test_the_budget_is_that_of_a_process_and_no_other_id():
+    assert SkipConfig().kept_bytes == SkipConfig().frozen_budget - OTHERS == 3 << 28
+    assert SkipConfig(frozen_budget=OTHERS // 2).kept_bytes == 0
 
 
 def test_a_learned_indicator_is_rendered_in_full(tiny_scene: Scene, tmp_path: Path):

@@ -21,8 +21,9 @@ from vlgs.training.build import Parts, build_module, scaled
 from vlgs.training.checkpoint import load_checkpoint
 from vlgs.training.fit import FitOptions
 from vlgs.training.lightning import VLGSModule
-from vlgs.training.separate import for_language
+from vlgs.training.separate import for_language, without_language
 from vlgs.training.stages import Progress, run_stages
+from vlgs.training.state import capture, restore
 from vlgs.training.workshop import Workshop
 from vlgs.types import Scene, View
 
@@ -190,3 +191,24 @@ def test_a_weight_that_nothing_trains_keeps_no_gaussian_alive(
     alone = for_language(parts)
     made = build_module(tiny_scene, alone, 0, color=False)
     assert made.densifying.config.prune_on == "indicator"
+
+
+def test_colour_alone_carries_no_codes_that_nothing_reads(tiny_scene: Scene):
+    """Codes of the method's width come with the stage that has language, at zero as before."""
+    parts = construct(composed("method=lift")).parts
+    silent = without_language(tiny_scene)
+    assert build_module(silent, parts, seed=0).model.splats["features"].shape[1] == 512
+    geometry = build_module(silent, parts, seed=0, codes=False)
+    assert geometry.model.splats["features"].shape[1] == 1
+    assert geometry.model.levels == 1
+    lifted = build_module(tiny_scene, parts, 0, start=dict(geometry.model.splats))
+    assert lifted.model.splats["features"].shape[1] == 512
+    assert not lifted.model.splats["features"].any()
+    # A checkpoint of before has codes of zeros.
+    saved = capture(geometry, {})
+    wide = saved.tensors | {"model.splats.features": torch.zeros(geometry.count, 512)}
+    restore(geometry, replace(saved, tensors=wide))
+    assert geometry.model.splats["features"].shape[1] == 1
+    drawn = replace(parts, gaussians=replace(parts.gaussians, init_features="normal"))
+    kept = build_module(silent, drawn, seed=0, codes=False)
+    assert kept.model.splats["features"].shape[1] == 512, "a later stage goes on from these"

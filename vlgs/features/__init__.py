@@ -1,4 +1,4 @@
-"""Language maps from photographs: masks of a segmenter, a vector each from an image encoder, in LangSplat's files.
+"""Language maps from photographs: masks of a segmenter, or tiles, and a vector each from an image encoder, in LangSplat's files.
 
 `python -m vlgs.features data=colmap data.root=SCENE`; the parts are Protocols, chosen by ``conf/features``.
 """

@@ -140,13 +140,24 @@ class MaskExtractor:
         keys = [mask.key for mask in masks]
         distinct = {key: mask for key, mask in zip(keys, masks, strict=True)}
         position = {key: i for i, key in enumerate(distinct)}
-        vectors = self.encoder(image, list(distinct.values()), stem)
-        norms = np.linalg.norm(vectors, axis=1, keepdims=True)
-        wrong = np.flatnonzero(~(np.isfinite(norms[:, 0]) & (norms[:, 0] > 0)))
-        if len(wrong):
-            box = list(distinct.values())[int(wrong[0])].box
-            raise ValueError(
-                f"features: vectors of {stem} must be finite and not zero, got length {norms[wrong[0], 0]} for the mask "
-                f"in box {box} and {len(wrong) - 1} others"
-            )
-        return (vectors / norms).astype(np.float32)[[position[key] for key in keys]]
+        vectors = encode(self.encoder, image, list(distinct.values()), stem)
+        return vectors[[position[key] for key in keys]]
+
+
+def encode(
+    encoder: Encoder, image: UInt8[np.ndarray, "h w 3"], masks: Sequence[Mask], stem: str
+) -> Float32[np.ndarray, "m e"]:
+    """What an encoder says of masks, at unit length.
+
+    Raises:
+        ValueError: If a vector is not finite, or zero.
+    """
+    vectors = encoder(image, masks, stem)
+    norms = np.linalg.norm(vectors, axis=1, keepdims=True)
+    wrong = np.flatnonzero(~(np.isfinite(norms[:, 0]) & (norms[:, 0] > 0)))
+    if len(wrong):
+        raise ValueError(
+            f"features: vectors of {stem} must be finite and not zero, got length {norms[wrong[0], 0]} for the mask "
+            f"in box {masks[int(wrong[0])].box} and {len(wrong) - 1} others"
+        )
+    return (vectors / norms).astype(np.float32)

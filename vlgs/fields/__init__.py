@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vlgs.types import Camera, DepthKind
@@ -117,6 +117,24 @@ class HasDepth(Protocol):
 
     def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
         """Camera z of what each pixel shows, in world units, 0 where nothing is; `vlgs.ops.depth.render_depth` says which."""
+        ...
+
+
+@runtime_checkable
+class HasObjects(Protocol):
+    """What a field of one mask level also answers that tells objects apart, which have numbers from 0."""
+
+    @property
+    def object_count(self) -> int:
+        """How many there are; 0: it knows none."""
+        ...
+
+    def objects(self, camera: Camera) -> Int[Tensor, "h w"]:
+        """The likeliest object of each pixel; `object_count` where it is none."""
+        ...
+
+    def with_objects(self, words: Float[Tensor, "k e"], chosen: Bool[Tensor, "k objects"]) -> Field:
+        """The same field, whose score of these words is the probability of the objects that are chosen for each."""
         ...
 
 

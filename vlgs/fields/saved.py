@@ -21,7 +21,7 @@ from vlgs.fields.radiance import Frame, RadianceConfig, RadianceField
 from vlgs.fields.rays import Spacing
 from vlgs.fields.several import SeveralFields
 from vlgs.fields.splat import SplatModel
-from vlgs.fields.trained import SplatField
+from vlgs.fields.trained import ObjectField, SplatField
 from vlgs.gaussians.attributes import Attribute
 from vlgs.gaussians.validate import require_sound
 from vlgs.ops.rasterize import check_config
@@ -116,11 +116,22 @@ def _splats_together(plan: Plan, tensors: Tensors, make: MakePart) -> SplatField
         raw, fusion, indicator, head, raster, degree, bool(plan["evaluated"]), attributes
     )
     _load(model, {k: v for k, v in tensors.items() if k.partition(".")[0] in ("splats", *_CHOSEN)})
-    if model.splats["features"].shape[1] % head.dim:
+    if plan["language"] and model.splats["features"].shape[1] % head.dim:
         raise ValueError(
             f"{_WHO}: features must be as wide as codes of {head.dim}, or several of them, got {model.splats['features'].shape[1]}"
         )
     return SplatField(model, bool(plan["color"]), plan["level"], bool(plan["language"]))
+
+
+def _objects_apart(field: ObjectField) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    plan, tensors = _splats_apart(field)
+    objects = {"objects.words": field.words, "objects.chosen": field.chosen}
+    return plan | {"kind": "objects"}, tensors | objects
+
+
+def _objects_together(plan: Plan, tensors: Tensors, make: MakePart) -> ObjectField:
+    words, chosen = tensors["objects.words"], tensors["objects.chosen"]
+    return _splats_together(plan, tensors, make).with_objects(words, chosen.bool())
 
 
 def _several_apart(field: SeveralFields) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -223,6 +234,7 @@ def _frame_together(plan: Plan, tensors: Tensors) -> Frame:
 
 
 _KINDS: Mapping[str, tuple[type, Callable[..., Any], Callable[..., Field]]] = {
+    "objects": (ObjectField, _objects_apart, _objects_together),  # which is a field of splats, too
     "splats": (SplatField, _splats_apart, _splats_together),
     "several": (SeveralFields, _several_apart, _several_together),
     "planes": (PlaneField, _planes_apart, _planes_together),

@@ -99,8 +99,8 @@ class SplatModel(nn.Module):
 
     @property
     def levels(self) -> int:
-        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``."""
-        return self.splats["features"].shape[1] // self.head.dim
+        """Number of mask levels that a Gaussian has a code for; above 1 with ``levels=joint``, and 1 where a stage of colour alone leaves codes out."""
+        return max(1, self.splats["features"].shape[1] // self.head.dim)
 
     def gaussians(self) -> Gaussians:
         """The Gaussians in natural units."""

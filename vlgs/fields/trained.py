@@ -5,13 +5,14 @@ from dataclasses import replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vlgs.fields import Field, FieldImages, PointCloud, require_outputs
 from vlgs.fields.cloud import point_cloud
-from vlgs.fields.similarity import decoded_cosines, rendered_feature
+from vlgs.fields.similarity import CHUNK, decoded_cosines, rendered_feature
 from vlgs.fields.splat import FusedGaussians, SplatModel
+from vlgs.heads.classifier import Classifier
 from vlgs.ops.depth import render_depth
 from vlgs.types import Camera, DepthKind
 
@@ -114,6 +115,31 @@ class SplatField:
         """See `HasGaussians`; the codes of all levels, whichever is asked."""
         return point_cloud(self.model, cameras, self.color)
 
+    @property
+    def object_count(self) -> int:
+        """See `HasObjects`."""
+        head = self.model.head
+        return head.classes - 1 if isinstance(head, Classifier) else 0
+
+    @torch.no_grad()
+    def objects(self, camera: Camera) -> Int[Tensor, "h w"]:
+        """See `HasObjects`."""
+        (codes,) = rendered_feature(self, camera, None, None)
+        parts = codes.flatten(0, 1).split(CHUNK)
+        found = torch.cat([self._classifier.logits(part).argmax(dim=-1) for part in parts])
+        return found.view(codes.shape[:2])
+
+    def with_objects(
+        self, words: Float[Tensor, "k e"], chosen: Bool[Tensor, "k objects"]
+    ) -> "ObjectField":
+        """See `HasObjects`."""
+        return ObjectField(self.model, words, chosen, self.color, self.level)
+
+    @property
+    def _classifier(self) -> Classifier:
+        assert isinstance(self.model.head, Classifier)  # `object_count`
+        return self.model.head
+
     @cached_property
     def _each(self) -> Sequence[Field]:
         return [SplatField(self.model, self.color, level) for level in range(self.model.levels)]
@@ -142,6 +168,57 @@ class SplatField:
     ) -> Float[Tensor, "levels k h w"]:
         decode = self.model.head.decode
         return _stack([decoded_cosines(decode, level, words) for level in codes])
+
+
+class ObjectField(SplatField):
+    """A field that scores some words by the probability of their objects, and all others by cosines.
+
+    Args:
+        model: The trained scene, whose head is a classifier.
+        words: Text vectors that have objects.
+        chosen: Which objects each one has.
+        color: See `SplatField`.
+        level: Likewise.
+
+    Raises:
+        ValueError: If the words or the objects are not those that there are, or it is of several mask levels.
+    """
+
+    def __init__(
+        self,
+        model: SplatModel,
+        words: Float[Tensor, "k e"],
+        chosen: Bool[Tensor, "k objects"],
+        color: bool = True,
+        level: int | None = None,
+    ) -> None:
+        super().__init__(model, color, level)
+        if len(self.levels()) > 1:
+            raise ValueError(f"object field: mask levels must be 1, got {len(self.levels())}")
+        wanted = [len(words), self.object_count]
+        if words.dim() != 2 or list(chosen.shape) != wanted or not self.object_count:
+            raise ValueError(f"object field: objects must be {wanted}, got {list(chosen.shape)}")
+        self.words = words
+        self.chosen = chosen
+
+    def _compare(
+        self, codes: Float[Tensor, "levels h w d"], words: Float[Tensor, "k e"]
+    ) -> Float[Tensor, "levels k h w"]:
+        scores = super()._compare(codes, words)
+        for row, word in enumerate(words):
+            for own, chosen in zip(self.words, self.chosen, strict=True):
+                if torch.equal(own, word):
+                    scores[0, row] = self._probability(codes[0], chosen)
+        return scores
+
+    def _probability(
+        self, codes: Float[Tensor, "h w d"], chosen: Bool[Tensor, " objects"]
+    ) -> Float[Tensor, "h w"]:
+        """That a pixel shows one of the objects."""
+        parts = codes.flatten(0, 1).split(CHUNK)
+        logits = (self._classifier.logits(part) for part in parts)
+        found = [one.softmax(dim=-1)[:, :-1][:, chosen].sum(dim=-1) for one in logits]
+        return torch.cat(found).view(codes.shape[:2])
 
 
 def _stack(parts: Sequence[Tensor]) -> Tensor:

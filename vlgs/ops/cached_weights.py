@@ -109,6 +109,20 @@ class CachedView:
         return self._weights.render(values)
 
 
+@torch.no_grad()
+def weights_bytes(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    weight: Float[Tensor, " n"],
+    camera: Camera,
+    config: RasterConfig,
+) -> int:
+    """Bytes that the weights of a `CachedView` would take, of which none is kept."""
+    splats = project(means, quats, scales, camera, config)
+    return KERNELS.of(means)(splats, weight, camera, config).weights.nbytes
+
+
 class _CpuWeights:
     """csrc/cached_weights.cpp."""
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from vlgs.fields import Field
 from vlgs.query.hyperplane import Hyperplane
+from vlgs.query.objects import Objects
 from vlgs.query.prompts import Prompts, encode_prompts
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.query.text import TextEncoder
@@ -18,6 +19,8 @@ __all__ = [
     "Hyperplane",
     "Learning",
     "LerfRelevancy",
+    "Objects",
+    "Particular",
     "Prompts",
     "Query",
     "Questions",
@@ -69,4 +72,17 @@ class Learning(Protocol):
 
     def learn(self, field: Field, scene: Scene, prompts: Prompts) -> Field:
         """The same field, which answers these words as they were learned."""
+        ...
+
+
+@runtime_checkable
+class Particular(Protocol):
+    """What a query also is that not every scene will do for."""
+
+    def require(self, scene: Scene, words: Sequence[str]) -> None:
+        """Refuse a scene whose words it could not answer, before anything is trained.
+
+        Raises:
+            ValueError: If the scene lacks something, or what was given for it.
+        """
         ...

@@ -1,9 +1,8 @@
 """GOI's optimisable hyperplane: what belongs to a word is learned from a mask in one view, and asked of all others (Qu et al., ACM MM 2024)."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +13,8 @@ from vlgs.fields import Field
 from vlgs.fields.planes import Plane, with_planes
 from vlgs.fields.similarity import cosines
 from vlgs.query.prompts import Prompts
-from vlgs.types import Scene, View
+from vlgs.query.view_masks import masks_from
+from vlgs.types import Scene
 from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
@@ -30,9 +30,8 @@ class Hyperplane:
     """Relevancy is ``sigmoid(f w / scale + b)`` of a unit feature f, with a plane (w, b) for each word.
 
     A plane starts as the word itself and is moved by gradient descent on the hinge loss of the pixels of one training view, until
-    its answer there overlaps the mask well enough. GOI takes this mask from a network that finds what words refer to. Here it is one of
-    the training views' masks whose vectors are nearest to the word: the one whose pixels the field itself sets apart most, since single
-    masks may carry the vector of something else.
+    its answer there overlaps the mask well enough. GOI takes this mask from a network that finds what words refer to. Here it comes from a
+    folder (`vlgs.query.view_masks.MaskFolder`), or it is one of the scene's own (`vlgs.query.view_masks.OwnMasks`).
 
     Args:
         scale: Of the products; that of APE's embeddings in GOI.
@@ -41,7 +40,8 @@ class Hyperplane:
         learning_rate: Of the descent.
         steps: At most.
         overlap: IoU with the mask at which a plane is good enough.
-        candidates: How many of the nearest masks are looked at.
+        candidates: How many of the nearest masks are looked at, of the scene's own.
+        masks: Folder of ``<word>/<view>.png``; null: the scene's own masks.
 
     Raises:
         ValueError: If a number is out of range.
@@ -53,6 +53,7 @@ class Hyperplane:
     steps: int = 8000
     overlap: float = 0.9
     candidates: int = 5
+    masks: str | None = None
 
     def __post_init__(self) -> None:
         require_range("hyperplane", 1e-6, 1e6, scale=self.scale)
@@ -87,9 +88,13 @@ class Hyperplane:
         """Without a mask to learn from: the planes as they start with ``bias``, or through the origin."""
         return (cosines(features, text) / self.scale + (self.bias or 0.0)).sigmoid()
 
+    def require(self, scene: Scene, words: Sequence[str]) -> None:
+        """Refuse masks that no word could be learned from; see `vlgs.query.Particular`."""
+        masks_from(self.masks, self.candidates).require(scene, words)
+
     @torch.no_grad()
     def learn(self, field: Field, scene: Scene, prompts: Prompts) -> Field:
-        """The same field, which answers these words by planes; one that no training view has a mask for stays as it starts.
+        """The same field, which answers these words by planes; that of a word without a mask stays as it starts.
 
         Args:
             field: The trained scene. Of several mask levels the last, of whole objects, is looked at.
@@ -97,8 +102,9 @@ class Hyperplane:
             prompts: The words.
         """
         planes, whole = [], field.levels()[-1]
+        masks = masks_from(self.masks, self.candidates)
         for name, word in zip(prompts.names, normalize(prompts.text.float(), dim=-1), strict=True):
-            found = self._mask_of(whole, scene, word)
+            found = masks.find(whole, scene, name, word)
             if found is None:
                 planes.append(Plane(word / self.scale, self.bias or 0.0))
                 continue
@@ -141,18 +147,6 @@ class Hyperplane:
             offset = offset - self.learning_rate * slope.sum()
         return Plane(best[0] / self.scale, best[1]), best_overlap
 
-    def _mask_of(
-        self, field: Field, scene: Scene, word: Float[Tensor, " e"]
-    ) -> tuple[View, Bool[Tensor, "h w"]] | None:
-        """The mask of a training view that is taken for a word; None without any."""
-
-        def contrast(found: tuple[View, Bool[Tensor, "h w"]]) -> float:
-            view, mask = found
-            answer = field.similarity(view.camera, word[None])[0, 0]
-            return float(answer[mask].mean() - answer[~mask].mean())
-
-        return max(islice(_masks_of(scene, word), self.candidates), key=contrast, default=None)
-
 
 def hinge_slope(
     distance: Float[Tensor, " r"], inside: Float[Tensor, " r"], outside: Float[Tensor, " r"]
@@ -160,21 +154,6 @@ def hinge_slope(
     """Gradient of the mean of ``max(0, 1 - d)`` inside and ``max(0, 1 + d)`` outside by the distances d; counts say how often each is there."""
     slope = outside * (distance > -1) - inside * (distance < 1)
     return slope / (inside.sum() + outside.sum())
-
-
-def _masks_of(
-    scene: Scene, word: Float[Tensor, " e"]
-) -> Iterator[tuple[View, Bool[Tensor, "h w"]]]:
-    """Training views and their masks, those whose vectors are nearest to a word first."""
-    order = (normalize(scene.mask_vectors.float(), dim=-1) @ word).argsort(descending=True)
-    for row in order.tolist():
-        for view in scene.train:
-            if view.read_masks is None:
-                continue
-            mask = view.read_masks() == row
-            mask = mask if mask.dim() == 2 else mask.any(dim=-1)
-            if mask.any() and not mask.all():
-                yield view, mask
 
 
 def _different(

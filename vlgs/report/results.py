@@ -54,6 +54,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "",
         "single: one model of one level; separate: a model for each; joint: one model with codes of all",
     ),
+    "query": (
+        "",
+        "option of conf/query that words were asked by, and the folder of masks that it learned from where one was given",
+    ),
     "train_seconds": (
         "s",
         "wall time of training, of all models together, without reading, evaluation and pictures",

@@ -70,6 +70,8 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
     width = max((len(label) for label in paths), default=0)
     places = [_text(f"{label:<{width}}  {path}") for label, path in paths.items()]
     told = [f"protocol: {metrics.get('protocol')}"]
+    if metrics.get("query"):
+        told.append(f"query: {metrics['query']}")
     if metrics.get("levels"):
         several = f" ({metrics.get('level_models')})" if len(metrics["levels"]) > 1 else ""
         told.append(f"mask levels: {', '.join(map(str, metrics['levels']))}{several}")

@@ -4,7 +4,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -51,6 +51,9 @@ class Augment(Stages, Protocol):
 @dataclass(frozen=True)
 class NoAugment:
     """The training views alone."""
+
+    as_photographed: ClassVar[bool] = True
+    """No view is rendered."""
 
     def identity(self) -> str:
         """See `Augment`."""

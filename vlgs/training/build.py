@@ -78,6 +78,7 @@ def build_module(
     seed: int,
     color: bool = True,
     start: Mapping[str, Tensor] | None = None,
+    codes: bool = True,
 ) -> VLGSModule:
     """Fit the head, place the Gaussians and put everything together.
 
@@ -87,6 +88,7 @@ def build_module(
         seed: Of all draws.
         color: Off: language alone. A fusion that comes to trained Gaussians would change their colours, and still learns from both.
         start: Raw parameters to start from; None: those of ``gaussians.init``, or the scene's points.
+        codes: Off: Gaussians carry a single number in place of codes that would stay zero, as a later stage gives them its own.
 
     Raises:
         ValueError: If the scene has no training view.
@@ -103,8 +105,10 @@ def build_module(
         log.info("no language supervision: training colour only, without fusion or blended views")
         fusion = NoFusion()
     config = replace(config, prune_on=pruned_on(config, parts.indicator, scene, color))
-    width = head.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
+    # Codes that come with the Gaussians or are drawn are not zero: a later stage goes on from these.
+    given = config.init is not None or config.init_features == "normal"
+    width = head.dim * scene.mask_levels if codes or language or given else 1
     own = language and parts.sharing.own_shape
     several = has(parts.indicator, "each_level") and scene.mask_levels > 1
     levels = scene.mask_levels if several else None

@@ -1,6 +1,7 @@
 """Training with frozen geometry: everything about a view that stays constant is computed once."""
 
-from collections.abc import Hashable
+import logging
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -8,9 +9,11 @@ from torch import Tensor
 
 from vlgs.fields.cached_weights import CachedViews
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
-from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.cached_weights import CachedView, weights_bytes
 from vlgs.skip_count import SkipCount
 from vlgs.types import Camera, Covariance
+
+log = logging.getLogger(__name__)
 
 
 def freeze(model: SplatModel, names: tuple[str, ...], densify_stop: int) -> None:
@@ -45,13 +48,20 @@ class CachedRenders:
 
     Args:
         model: Whose means, quats and scales do not change.
+        cameras: Of the training views. Weights of the first ones are kept, as far as the budget goes: which ones does not depend on the order in
+            which they come, so that a resumed run has the bits of one that was not interrupted.
         budget: Bytes for the weights of all views.
         counts: Where work done and left out is counted.
     """
 
-    def __init__(self, model: SplatModel, budget: int, counts: SkipCount) -> None:
+    def __init__(
+        self, model: SplatModel, cameras: Sequence[Camera], budget: int, counts: SkipCount
+    ) -> None:
         self.model = model
+        self.cameras = cameras
         self.views = CachedViews(budget)
+        self._left = budget
+        self._first: dict[str, int] = {}
         self.counts = counts
         self._colors: dict[int, Tensor] = {}
 
@@ -89,7 +99,7 @@ class CachedRenders:
 
     def _view(
         self,
-        name: Hashable,
+        name: tuple[int, str],
         camera: Camera,
         weight: Float[Tensor, " n"],
         shape: Covariance,
@@ -99,7 +109,10 @@ class CachedRenders:
         if view is not None:
             self.counts.skip("frozen_weights")
             return view
-        if self.views.refused(name):
+        index, kind = name
+        if kind not in self._first:
+            self._first[kind] = self._how_many(weight, shape, fused)
+        if index >= self._first[kind]:
             return None
         with self.counts.doing("weights"):
             return self.views.make(
@@ -111,6 +124,22 @@ class CachedRenders:
                 camera=camera,
                 config=self.model.raster,
             )
+
+    def _how_many(
+        self, weight: Float[Tensor, " n"], shape: Covariance, fused: FusedGaussians
+    ) -> int:
+        """So many views, the first ones, fit into what is left of the budget, and are taken from it."""
+        means, raster = fused.gaussians.means, self.model.raster
+        for index, camera in enumerate(self.cameras):
+            size = weights_bytes(means, shape.quats, shape.scales, weight, camera, raster)
+            if size > self._left:
+                log.info(
+                    "frozen weights: of %d of %d views, others are rendered in full (trainer.skip.frozen_budget)",
+                    index, len(self.cameras),
+                )  # fmt: skip
+                return index
+            self._left -= size
+        return len(self.cameras)
 
     def _color(
         self, index: int, camera: Camera, view: CachedView, fused: FusedGaussians

@@ -1,12 +1,12 @@
 """The stage that trains a language field at the means of finished Gaussians (FMGS; Zuo et al., IJCV 2024; its released program)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import huber_loss, interpolate, normalize
 
 from vlgs.demands import Demand
@@ -84,7 +84,7 @@ class TrainHashFeatures:
         """See `vlgs.training.stages.Stage`. A mask level without a single mask has colour alone."""
         models: dict[int | None, Field] = {}
         for level, scene in progress.scenes.items():
-            start = progress.gaussians(self.start, level)
+            start = _with_codes(progress.gaussians(self.start, level))
             models[level] = SplatField(start)
             if len(scene.mask_vectors):
                 learner = HashLearner(
@@ -142,7 +142,7 @@ class HashLearner(Learner):
             (splats.splats["means"].detach() - self.frame.center) * self.frame.scale
         )
         self.seen = [index for index, view in enumerate(scene.train) if view.read_masks is not None]
-        self._views = CachedViews(settings.skip.frozen_budget)
+        self._views = CachedViews(settings.skip.kept_bytes)
         self._rows: dict[int, Tensor] = {}
         self._seconds: dict[int, Tensor] = {}
 
@@ -201,6 +201,16 @@ class HashLearner(Learner):
             small = interpolate(target, tuple(size), mode="area")[0].permute(1, 2, 0)
             self._seconds[index] = small.half()
         return self._seconds[index].float()
+
+
+def _with_codes(model: SplatModel) -> SplatModel:
+    """The same model, whose Gaussians have codes again if a stage of colour alone left them out; all zero."""
+    features, width = model.splats["features"], model.head.dim
+    if features.shape[1] < width:
+        model.splats["features"] = nn.Parameter(features.new_zeros(len(features), width), False)
+        row = replace(model.attributes["features"], shape=(width,))
+        model.attributes = {**model.attributes, "features": row}
+    return model
 
 
 def embedding_loss(

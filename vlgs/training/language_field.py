@@ -41,6 +41,7 @@ class TrainLanguageField:
     """
 
     demands: ClassVar[Sequence[Demand]] = NO_GAUSSIANS
+    without_gaussians: ClassVar[bool] = True
     start: str
     """The earlier stage that made the radiance field."""
     name: str = ""

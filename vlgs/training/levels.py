@@ -29,6 +29,8 @@ class Levels(Stages, Protocol):
 class Single:
     """One mask level."""
 
+    one_model: ClassVar[bool] = True
+    """One model learns all masks that are read."""
     read: Sequence[int] = ()
     codes: int = CODES["single"]
 
@@ -53,6 +55,7 @@ class Separate:
 class Joint:
     """One model for all mask levels."""
 
+    one_model: ClassVar[bool] = True
     joint: ClassVar[bool] = True
     """A model has something of its own for each level."""
     read: Sequence[int] = LEVELS

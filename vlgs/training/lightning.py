@@ -83,7 +83,12 @@ class VLGSModule(L.LightningModule):
             setup,
             config.densify_on == "rgb",
             Exposure(len(viewmats)) if settings.exposure and color else None,
-            CachedRenders(model, settings.skip.frozen_budget, setup.counts)
+            CachedRenders(
+                model,
+                [view.camera for view in views.scene.train],
+                settings.skip.kept_bytes,
+                setup.counts,
+            )
             if keeps and has_frozen_shape(model)
             else None,
         )

@@ -22,9 +22,16 @@ from vlgs.training.workshop import Workshop
 from vlgs.types import Scene
 from vlgs.values import require_fields, require_range
 
-NO_GAUSSIANS = tuple(
-    Demand("a radiance field", group, "untrained", "as there are no Gaussians that it could act on")
-    for group in ("fusion", "indicator", "head")
+_FIELD = "a radiance field"
+NO_GAUSSIANS = (
+    *(
+        Demand(_FIELD, group, "untrained", "as there are no Gaussians that it could act on")
+        for group in ("fusion", "indicator", "head")
+    ),
+    Demand(
+        _FIELD, "augment", "as_photographed", "as there are no Gaussians to render further views"
+    ),
+    Demand(_FIELD, "levels", "one_model", "as there is one field for all mask levels"),
 )
 """What stages without Gaussians ask of the axes."""
 
@@ -41,6 +48,7 @@ class TrainRadiance:
     """
 
     demands: ClassVar[Sequence[Demand]] = NO_GAUSSIANS
+    without_gaussians: ClassVar[bool] = True
     name: str = "radiance"
     """Of the sub-folder."""
     radiance: RadianceConfig = field(default_factory=RadianceConfig)

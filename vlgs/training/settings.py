@@ -44,6 +44,11 @@ class LearningRates:
                 )
 
 
+OTHERS = 5 << 28
+"""Bytes of ``frozen_budget`` that are left to photographs, Gaussians, their optimiser and libraries; a constant, and not what a process happens to
+hold, so that the same views are kept everywhere. With 101 photographs of 246x182 LangSplatV2's codes and all else take 1.1e9."""
+
+
 @dataclass(frozen=True)
 class SkipConfig:
     """Work of an iteration that is left out; `vlgs.skips` says what each costs in accuracy."""
@@ -55,7 +60,12 @@ class SkipConfig:
     frozen_weights: bool = True
     """Keep the blending weights of every view when geometry and weights are frozen."""
     frozen_budget: int = 2 << 30
-    """Bytes that the kept weights of all views may take together."""
+    """Bytes that a process which keeps the weights of views may take, everything else included (`OTHERS`)."""
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes that the kept weights of all views may take together."""
+        return max(0, self.frozen_budget - OTHERS)
 
     def __post_init__(self) -> None:
         if not 0 <= self.blend_reuse <= 0.5:

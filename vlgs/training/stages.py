@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Protocol, runtime_checkable
 
-from vlgs.demands import Demand
+from vlgs.demands import Demand, has
 from vlgs.fields import Field
 from vlgs.fields.several import SeveralFields
 from vlgs.fields.splat import SplatModel
@@ -151,6 +151,11 @@ class Method:
         why = "as the stages say how models are made"
         return [Demand("stages of a method", "sharing", "replaceable", why), *asked]
 
+    @property
+    def without_gaussians(self) -> bool:
+        """Whether none of its stages makes a Gaussian, which they say themselves."""
+        return all(has(stage, "without_gaussians") for stage in self.listed)
+
     def stages(self, language: bool) -> Sequence[Stage]:
         """See `Stages`."""
         return self.listed
@@ -256,7 +261,7 @@ class TrainColor:
         """See `Stage`."""
         scene = without_language(next(iter(progress.scenes.values())))
         change = partial(scaled, share=self.share)
-        trained = workshop.train(self.name, scene, change, kept=self.kept)
+        trained = workshop.train(self.name, scene, change, kept=self.kept, codes=self.kept)
         model = SplatField(trained.model, language=False)
         return progress.having(self.name, {None: model})
 

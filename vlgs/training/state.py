@@ -77,6 +77,10 @@ def _restore_model(module: VLGSModule, tensors: dict[str, Tensor]) -> None:
         raise ValueError(
             f"resume: checkpoint must hold the tensors of this model, got a difference in {odd}"
         )
+    if not module.views.has_language:
+        # Earlier checkpoints have zeros as wide as the head's codes where there is one number now.
+        width = module.model.splats["features"].shape[1]
+        tensors = {**tensors, "splats.features": tensors["splats.features"][:, :width]}
     for group in module.optimizer.param_groups:
         name = group["name"]
         if name in module.model.splats:

@@ -98,6 +98,7 @@ class Workshop:
         start: SplatModel | None = None,
         color: bool = True,
         kept: bool = True,
+        codes: bool = True,
     ) -> SplatField:
         """Train a model, or read it back.
 
@@ -108,6 +109,7 @@ class Workshop:
             start: Whose Gaussians it starts from; None: what the parts say.
             color: Off: language alone; colours that it starts with stay as they are.
             kept: See `Made`.
+            codes: See `build_module`.
 
         Raises:
             StoppedError: If it was asked to stop.
@@ -115,9 +117,10 @@ class Workshop:
         folder = self.folder.part(name)
         if name:
             log.info("model %s of this run, in %s", name, folder.path)
-        module = self._build(scene, change(self.make_parts()), start, color)
+        module = self._build(scene, change(self.make_parts()), start, color, codes)
         stopped_by = fit(module, folder, self._options(module, color or start is not None))
         require_done(module, stopped_by, name)
+        module.step.frozen = None  # weights of views: what comes after training needs the memory
         return self._remember(name, module, color or start is not None, kept)
 
     def lift(
@@ -152,10 +155,15 @@ class Workshop:
         return replace(options, meta={**options.meta, "plan": plan})
 
     def _build(
-        self, scene: Scene, parts: Parts, start: SplatModel | None, color: bool = True
+        self,
+        scene: Scene,
+        parts: Parts,
+        start: SplatModel | None,
+        color: bool = True,
+        codes: bool = True,
     ) -> VLGSModule:
         if start is None:
-            return build_module(scene, parts, self.seed, color)
+            return build_module(scene, parts, self.seed, color, codes=codes)
         # Copies: training moves them in place, and other models may start from the same ones.
         splats = {name: value.detach().clone() for name, value in start.splats.items()}
         return build_module(scene, parts, self.seed, color, splats)
