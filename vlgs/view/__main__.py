@@ -1,0 +1,99 @@
+"""Look around in a trained scene, and ask it for words, in a browser: `python -m vlgs.view RUN`; see `--help`."""
+
+import argparse
+import sys
+import time
+import webbrowser
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from vlgs.config import MOST_THREADS
+from vlgs.extras import require_extra
+from vlgs.runs import STOPPED
+from vlgs.text import screen
+from vlgs.values import require_range
+
+_HELP = """The pictures are those of vlgs.render and vlgs.query: relevancy as LERF-OVS measures it, the indicator, harmonics. They are coarse while
+the camera moves where the machine is too slow for all pixels. The middle of the window is the optical axis, also where a photograph's principal
+point lies elsewhere. A run that still trains is shown as of its newest checkpoint, and again when there is a newer one."""
+_POLL = 1.0
+"""Seconds between looks for a newer checkpoint."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Serve until Ctrl-C; exit status 1 and one line where that cannot be."""
+    parser = argparse.ArgumentParser(
+        prog="python -m vlgs.view",
+        description=__doc__,
+        epilog=_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUN", help="folder of a run; two are compared"
+    )
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="who may connect: 0.0.0.0 is everybody (this machine only)",
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="0 is any that is free (%(default)s)"
+    )
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="further words and vectors")
+    parser.add_argument(
+        "--text", metavar="MODEL", help="CLIP or SigLIP for words that no vocabulary has"
+    )
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads (%(default)s)")
+    parser.add_argument(
+        "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser here"
+    )
+    args = parser.parse_args(arguments)
+    try:
+        view(args)
+    except (ValueError, OSError) as error:
+        sys.exit(screen(f"error: {error}"))
+    except KeyboardInterrupt:
+        sys.exit(STOPPED)
+
+
+def view(args: argparse.Namespace) -> None:
+    """Serve the runs of a command line until Ctrl-C.
+
+    Raises:
+        ValueError: If a run cannot be opened, or an argument is wrong.
+        OSError: If a file cannot be read, or the port is taken.
+    """
+    require_range("view", 1, MOST_THREADS, threads=args.threads)
+    require_range("view", 0, 65535, port=args.port)
+    if len(args.runs) > 2:
+        raise ValueError(f"view: runs must be one or two, got {len(args.runs)}")
+    require_extra("viser", "viewer")
+    import torch
+
+    from vlgs.opened import open_run
+    from vlgs.view.server import Address, Server
+    from vlgs.view.shown import Shown
+    from vlgs.view.watch import Watch
+
+    torch.set_num_threads(args.threads)
+    opening = partial(open_run, vocabulary=args.vocabulary, text=args.text)
+    runs = [Shown(opening(folder)) for folder in args.runs]
+    watch = Watch(runs, opening)
+    server = Server(runs, Address(args.host, args.port))
+    try:
+        names = " and ".join(str(folder) for folder in args.runs)
+        print(screen(f"{server.address.url} shows {names}; Ctrl-C ends"), flush=True)
+        if args.open:
+            webbrowser.open(server.address.url)
+        while server.worker.failure is None:
+            time.sleep(_POLL)
+            if watch.poll():
+                server.worker.ask_again()
+        raise server.worker.failure
+    finally:
+        server.stop()
+
+
+if __name__ == "__main__":
+    main()
