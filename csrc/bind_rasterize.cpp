@@ -69,6 +69,13 @@ void bind_rasterize_of(nb::module_ &m, const char *name) {
           },
           strict("values"), strict("d_images"), strict("d_alphas"), strict("d_mean2d").none(),
           strict("d_ellipse").none(), strict("d_weights"), strict("d_values"), "threads"_a)
+      .def(
+          "median_rows",
+          [](const Rasterized<T> &self, Array<int64_t, -1, -1> rows, int threads) {
+            nb::gil_scoped_release unlocked;
+            self.median_rows(rows.data(), threads);
+          },
+          strict("rows"), "threads"_a)
       .def("work", [](const Rasterized<T> &self) {
         const RasterizeWork work = self.work();
         return std::pair(work.entries, work.weighed);

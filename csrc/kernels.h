@@ -172,6 +172,8 @@ constexpr int kSlotHead = 8;  // where wide channels begin
 // tile_intersect: block masks of one Gaussian over the tiles of a box, row by row.
 // rasterize_forward, rasterize_backward: one tile; with scratch as large as its *_scratch says. Backward
 //   writes one slot per entry of the tile's list and says whether all it read was finite.
+// median_rows: one tile of an image: row of the Gaussian behind which at most half of the first chain's light
+//   is left, -1 where more is left behind all.
 // cache_weights: weights of the first chain of one tile: entries per block, and if `ids` is given the entries
 //   themselves. cached_weights_render: one block of pixels of an image; scratch [channels, kPixels].
 //   cached_weights_upstream, cached_weights_backward: a block of pixels as [channels, kPixels], then the
@@ -191,6 +193,7 @@ constexpr int kSlotHead = 8;  // where wide channels begin
   KERNEL(int64_t, rasterize_backward_scratch, const Pass<T> &, int64_t list_length)                              \
   KERNEL(void, rasterize_forward, const Pass<T> &, int64_t tile, T *scratch, uint32_t *list)                     \
   KERNEL(bool, rasterize_backward, const Pass<T> &, int64_t tile, T *scratch, T *slots)                          \
+  KERNEL(void, median_rows, const Pass<T> &, int64_t tile, int64_t *rows)                                        \
   KERNEL(void, cache_weights, const Pass<T> &, int64_t tile, int64_t *counts, uint32_t *ids, T *weights)         \
   KERNEL(void, cached_weights_render, const Grid &, int64_t block, int64_t count, const uint32_t *ids,           \
          const T *weights, const T *values, int64_t channels, T *scratch, T *image)                              \

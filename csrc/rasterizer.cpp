@@ -355,6 +355,16 @@ void Rasterized<T>::backward(const RasterizeGrads<T> &d, int threads) const {
 }
 
 template <class T>
+void Rasterized<T>::median_rows(int64_t *rows, int threads) const {
+  const Pass<T> &p = stages_[0].pass;
+  if (!p.transmittance)
+    throw std::invalid_argument("rasterize: keep must be true where the median is asked for, got false");
+  const int64_t tiles = grid_.tiles_x * grid_.tiles_y;
+#pragma omp parallel for num_threads(worth(lists_.begin.back() + tiles, threads)) schedule(dynamic)
+  for (int64_t tile = 0; tile < tiles; ++tile) kernels<T>().median_rows(p, tile, rows);
+}
+
+template <class T>
 RasterizeWork Rasterized<T>::work() const {
   RasterizeWork work{lists_.begin.back(), 0};
   for (const Stage &s : stages_) {

@@ -56,6 +56,10 @@ class Rasterized {
 
   void backward(const RasterizeGrads<T> &, int threads) const;
 
+  // [height, width]: the Gaussian behind which at most half of the first chain's light is left, -1 where more
+  // is left behind all; needs `keep`.
+  void median_rows(int64_t *rows, int threads) const;
+
   // Counted afterwards, from the lists and what is kept for backward: needs `keep` and not `stop_before`.
   RasterizeWork work() const;
 

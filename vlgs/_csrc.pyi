@@ -88,6 +88,9 @@ class RasterizedFloat:
         d_values: Sequence[Tensor | None],
         threads: int,
     ) -> None: ...
+    def median_rows(self, rows: Tensor, threads: int) -> None:
+        """Rows [height, width] (int64) of what takes half of the light of the first weight, -1 without; needs ``keep``."""
+
     def work(self) -> tuple[int, int]:
         """Entries of all tile lists, and (Gaussian, 4x4 block, chain) triples weighed; needs ``keep`` and ``stop="after"``."""
 

@@ -194,6 +194,10 @@ class RasterConfig:
     """Whether groups with one weight tensor share one transmittance."""
 
 
+DepthKind = Literal["accumulated", "expected", "median"]
+"""Which depth of a pixel: sum_i w_i z_i; the same by the sum of the weights; or that at which half of the light is gone."""
+
+
 @dataclass(frozen=True)
 class Rendered:
     """What `vlgs.rasterize` returns."""

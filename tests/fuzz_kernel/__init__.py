@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from tests.fuzz_kernel.layers import run_cached_view, run_layers
+from tests.fuzz_kernel.layers import run_cached_view, run_depth, run_layers
 from tests.fuzz_kernel.scene import POISON, FuzzScene, make_scene
 from vlgs.ops.rasterize import rasterize
 from vlgs.types import Rendered
@@ -38,8 +38,8 @@ class FuzzReport:
 def run_scene(scene: FuzzScene) -> str | None:
     """Render and differentiate; returns the message of a named error, or None where all is finite.
 
-    After a full backward pass: the same picture without gradients, a backward pass for some gradients of some pictures, the first
-    group as a cached view, and the list of what may be seen.
+    After a full backward pass: the same picture without gradients, a backward pass for some gradients of some pictures, depths, the
+    first group as a cached view, and the list of what may be seen.
 
     Raises:
         AssertionError: If a result is not finite, has another shape than it should, differs where it should not, or a tame scene
@@ -54,6 +54,7 @@ def run_scene(scene: FuzzScene) -> str | None:
             "a picture without gradients has other bits",
         )
         _differentiate(scene, scene.asked, scene.used)
+        run_depth(scene.tensors, scene.width, scene.height, scene.config)
     except ValueError as error:
         _require(bool(NAMED.match(str(error))), f"error without a name: {error}")
         _require(not scene.tame, f"a tame scene was refused: {error}")

@@ -1,4 +1,4 @@
-"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, losses, cached views, peak_fma.
+"""Random input to the kernels beside the rasterizer: attention, view-dependent colour, losses, cached views, depth, peak_fma.
 
 What `tests.fuzz_kernel` does for scenes, more lightly: shapes at the edges of the kernels' chunks and lanes, poison in one case in
 four. These kernels look at nothing but shapes, and poison passes through them; ordinary numbers must stay finite. Squared errors are
@@ -6,6 +6,7 @@ compared with those of torch in float64, whatever the numbers are.
 """
 
 from collections.abc import Callable
+from typing import get_args
 
 import numpy as np
 import torch
@@ -14,9 +15,10 @@ from torch import Tensor
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.depth import camera_depth, render_depth
 from vlgs.ops.machine import peak_fma
 from vlgs.ops.view_color import view_color
-from vlgs.types import Camera, RasterConfig
+from vlgs.types import Camera, DepthKind, RasterConfig
 
 ROWS = (0, 1, 2, 15, 16, 17, 40)
 LONG = (2047, 2048, 2049, 4100)
@@ -73,6 +75,39 @@ def run_cached_view(
     _require(difference <= bound, f"cached view is off by {difference}, more than {bound}")
     (gradient,) = torch.autograd.grad(image, values, torch.ones_like(image))
     _require(bool(gradient.isfinite().all()), "gradient of a cached view is not finite")
+
+
+def run_depth(tensors: dict[str, Tensor], width: int, height: int, config: RasterConfig) -> None:
+    """Every kind of depth of a scene that was rendered without complaint, both ways.
+
+    Args:
+        tensors: Of a `tests.fuzz_kernel.scene.FuzzScene`.
+        width: Pixels.
+        height: Pixels.
+        config: The scene's.
+
+    Raises:
+        AssertionError: If a depth or a gradient is not finite, or a depth is behind all Gaussians.
+        ValueError: Where a gradient cannot be held.
+    """
+    camera = Camera(tensors["viewmat"], tensors["K"], width, height)
+    names = ("means", "quats", "scales", "weight0")
+    means, quats, scales, weight = leaves = [
+        tensors[name].clone().requires_grad_() for name in names
+    ]
+    farthest = camera_depth(tensors["means"], camera).nan_to_num(0).clamp_min(0)
+    most = farthest.amax().item() if len(farthest) else 0.0
+    for kind in get_args(DepthKind):
+        depth = render_depth(
+            means, quats, scales, weight, camera.viewmat, camera.K, width, height, config, kind
+        )
+        _require(bool(depth.isfinite().all()), f"{kind} depth is not finite")
+        bound = most * (1 + 1e3 * torch.finfo(depth.dtype).eps)
+        _require(0 <= depth.min().item() <= depth.max().item() <= bound, f"{kind} depth is too far")
+        grads = torch.autograd.grad(depth, leaves, torch.ones_like(depth), allow_unused=True)
+        for name, grad in zip(names, grads, strict=True):
+            fine = grad is None or bool(grad.isfinite().all())
+            _require(fine, f"gradient of the {kind} depth by {name} is not finite")
 
 
 Call = tuple[Callable[..., tuple[Tensor, ...]], list[Tensor]]

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ from vlgs.fields.hash_grid import GridConfig, HashGrid, contract, interpolate
 from vlgs.fields.language_field import LanguageConfig, LanguageField
 from vlgs.fields.nerf import along
 from vlgs.fields.radiance import Frame, RadianceConfig, RadianceField, Samples, harmonics, in_cube
-from vlgs.fields.rays import Rays, Spacing, ray_weights, spread
+from vlgs.fields.rays import Rays, Spacing, ray_depth, ray_weights, spread
 from vlgs.fields.similarity import cosines, decoded_cosines
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
@@ -56,14 +56,16 @@ from vlgs.objectives import CodebookLanguage, CodeClasses, Language, LookupLangu
 from vlgs.objectives.lookup import choice_error
 from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
 from vlgs.ops import l1_dssim as ops_l1_dssim
+from vlgs.ops import rasterize_reference
 from vlgs.ops import ssim as ops_ssim
 from vlgs.ops.attention import Token, attend
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.depth import at_rows, camera_depth, render_depth
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
 from vlgs.ops.view_color import view_color
 from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
-from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
+from vlgs.types import Camera, ChannelGroup, DepthKind, Gaussians, RasterConfig
 from vlgs.view_blend import FixedBlend, blend_targets
 from vlgs.view_blend.pose import slerp
 
@@ -138,6 +140,12 @@ NO_GRADIENT = {
         "hash_grid.HashGrid.corners", "rays.Spacing.__call__", "rays.importance", "rays.nearest_seen", "radiance.nearest_of",
     )},
     "vlgs.ops.rasterize_to_pixels.weights_alone": "the constants of a CachedView",
+    "vlgs.ops.depth.median_rows": "picks rows",
+    "vlgs.fields.HasDepth.depth": "protocol",
+    **{f"vlgs.fields.{name}": "training is over" for name in (
+        "depth_of", "trained.SplatField.depth", "hash_splat.HashSplatField.depth", "several.SeveralFields.depth",
+        "planes.PlaneField.depth", "nerf.NerfField.depth",
+    )},
     "vlgs.ops.cached_weights.Weights.render": "protocol",
     "vlgs.query.text.VocabularyText.encode": "takes words",
     "vlgs.query.text.ClipText.encode": "takes words",
@@ -175,6 +183,23 @@ def rasterizing(backend: str, outside: bool) -> Check:
 
     weights = [0.9 * w for w in s.weights]
     return images, [s.means, s.quats, s.scales, *weights, *s.values]
+
+
+def depths(kind: DepthKind, backend: str = "cpu") -> Check:
+    """One depth of the scene of `rasterizing`, seen by a turned camera; opaque enough for a median, and away from where it jumps."""
+    s = make_splats(5, seed=2, size=(6, 5), channels=(1,)).to(torch.float64)
+    viewmat = torch.eye(4).double()
+    viewmat[:3, :3] = quat_to_rotmat(torch.tensor([1.0, 0.02, -0.03, 0.01]).double())
+    camera = Camera(viewmat, view().K, 6, 5)
+
+    def image(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor):
+        splats = means, quats, scales, opacities
+        if backend == "reference":
+            return rasterize_reference.render_depth(*splats, camera, SMOOTH, kind)
+        return render_depth(*splats, camera.viewmat, camera.K, 6, 5, SMOOTH, kind)
+
+    opacities = 0.7 + 0.2 * s.weights[0]
+    return image, [s.means, s.quats, 2 * s.scales, opacities]
 
 
 def shape_alone() -> Check:
@@ -386,6 +411,15 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.ops.rasterize_to_pixels.rasterize_to_pixels": lambda: rasterizing("cpu", False),
     "vlgs.ops.project.project": lambda: rasterizing("cpu", True),
     "vlgs.ops.rasterize_reference.rasterize": lambda: rasterizing("reference", False),
+    **{f"vlgs.ops.depth.render_depth, {kind}": lambda kind=kind: depths(kind) for kind in get_args(DepthKind)},
+    **{
+        f"vlgs.ops.rasterize_reference.render_depth, {kind}": lambda kind=kind: depths(kind, "reference")
+        for kind in get_args(DepthKind)
+    },
+    "vlgs.ops.depth.camera_depth": lambda: (lambda means: camera_depth(means, view()), [draw(3, 3)]),
+    "vlgs.ops.depth.at_rows": lambda: (
+        lambda values: at_rows(values, torch.tensor([[0, -1, 2], [2, 2, -1]])), [draw(3)]
+    ),
     "vlgs.ops.cached_weights.CachedView.render": frozen,
     "vlgs.fields.splat.SplatModel.view_color": lambda: model(lambda m: m.view_color(m.fuse(), view())),
     "vlgs.fields.splat.SplatModel.gaussians": lambda: model(
@@ -511,6 +545,12 @@ CHECKS: dict[str, Callable[[], Check]] = {
     ),
     "vlgs.fields.hash_grid.HashGrid.forward": lambda: by_table(lambda grid: grid(PLACES)),
     "vlgs.fields.rays.Rays.points": lambda: (lambda o, d, t: Rays(o, d).points(t), [draw(2, 3), draw(2, 3, seed=1), draw(2, 4)]),
+    **{
+        f"vlgs.fields.rays.ray_depth, {kind}": lambda kind=kind: (
+            lambda d, w: ray_depth(d, w, kind), [draw(3, 4, low=1, high=2), draw(3, 4, seed=1, low=0.1)]
+        )
+        for kind in get_args(DepthKind)
+    },
     "vlgs.fields.rays.ray_weights": lambda: (ray_weights, [draw(3, 4, low=0.1), draw(3, 4, seed=1, low=0.1)]),
     "vlgs.fields.rays.spread": lambda: (
         lambda w: spread(draw(3, 5).sort(dim=1).values, w), [draw(3, 4, seed=1, low=0.1)]

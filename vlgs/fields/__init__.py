@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vlgs.types import Camera
+from vlgs.types import Camera, DepthKind
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,15 @@ class HasGaussians(Protocol):
         ...
 
 
+@runtime_checkable
+class HasDepth(Protocol):
+    """What a field that knows distances also answers."""
+
+    def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+        """Camera z of what each pixel shows, in world units, 0 where nothing is; `vlgs.ops.depth.render_depth` says which."""
+        ...
+
+
 NO_GAUSSIANS = "the field has no Gaussians"
 """Why a figure that speaks of Gaussians is not available."""
 
@@ -123,6 +132,19 @@ def gaussians_of(field: Field) -> Sequence[HasGaussians] | None:
     """The Gaussians of each mask level; None where the field has none."""
     found = [level for level in field.levels() if isinstance(level, HasGaussians)]
     return found if len(found) == len(field.levels()) else None
+
+
+def depth_of(field: Field, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+    """See `HasDepth`.
+
+    Raises:
+        ValueError: If the field knows no distances.
+    """
+    if not isinstance(field, HasDepth):
+        raise ValueError(
+            f"depth: the field must know distances (HasDepth), got {type(field).__name__}"
+        )
+    return field.depth(camera, kind)
 
 
 def require_outputs(who: str, outputs: Iterable[str], had: frozenset[str]) -> None:

@@ -12,7 +12,7 @@ from vlgs.fields.language_field import LanguageField
 from vlgs.fields.radiance import Frame, in_cube
 from vlgs.fields.similarity import CHUNK, cosines, rendered_feature
 from vlgs.fields.trained import SplatField
-from vlgs.types import Camera
+from vlgs.types import Camera, DepthKind
 
 
 class HashSplatField:
@@ -76,6 +76,10 @@ class HashSplatField:
     ) -> Float[Tensor, "h w c"]:
         """See `HasGaussians`."""
         return self.splats.render_values(camera, values, weight)
+
+    def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+        """See `HasDepth`."""
+        return self.splats.depth(camera, kind)
 
     def point_cloud(self, cameras: Sequence[Camera]) -> PointCloud:
         """See `HasGaussians`; language is no part of it, since no code of a Gaussian says it."""

@@ -9,8 +9,9 @@ from torch import Tensor
 from vlgs.fields import Field, FieldImages, require_outputs
 from vlgs.fields.language_field import LanguageField
 from vlgs.fields.radiance import RadianceField, Samples
+from vlgs.fields.rays import ray_depth
 from vlgs.fields.similarity import CHUNK, cosines, rendered_feature
-from vlgs.types import Camera
+from vlgs.types import Camera, DepthKind
 
 RAYS = 2048
 """Rays that are rendered at once."""
@@ -75,6 +76,17 @@ class NerfField:
             alpha=torch.ones(size) if "alpha" in outputs else None,
             feature=torch.cat(features).unflatten(0, size)[None] if features else None,
         )
+
+    @torch.no_grad()
+    def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+        """See `HasDepth`. What lies behind everything has a distance too, which draws the mean far back; the median it leaves alone."""
+        forward, parts = camera.viewmat[2, :3], []
+        for pixels in torch.arange(camera.height * camera.width).split(RAYS):
+            rays = self.radiance.frame.look(camera, pixels)
+            samples = self.radiance.sample(rays)
+            distance = ray_depth(samples.distances, self.radiance.weights(samples), kind)
+            parts.append(distance / self.radiance.frame.scale * (rays.directions @ forward))
+        return torch.cat(parts).unflatten(0, (camera.height, camera.width))
 
     @torch.no_grad()
     def similarity(

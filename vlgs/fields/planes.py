@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vlgs.fields import Field, FieldImages, HasGaussians, PointCloud
-from vlgs.types import Camera
+from vlgs.fields import Field, FieldImages, HasGaussians, PointCloud, depth_of
+from vlgs.types import Camera, DepthKind
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,10 @@ class PlaneField:
         asked, length, bias = self._asked(words)
         found = self.field.similarity(camera, asked, seen, pixels)
         return found * length[:, None, None] + bias[:, None, None]
+
+    def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+        """See `HasDepth`."""
+        return depth_of(self.field, camera, kind)
 
     def _asked(
         self, words: Float[Tensor, "k e"]

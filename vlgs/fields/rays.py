@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from vlgs.geometry import camera_center
-from vlgs.types import Camera
+from vlgs.types import Camera, DepthKind
 
 
 @dataclass(frozen=True)
@@ -133,6 +133,24 @@ def ray_weights(
     depth = density * lengths
     before = torch.cat([torch.zeros_like(depth[:, :1]), depth[:, :-1].cumsum(dim=-1)], dim=-1)
     return -torch.expm1(-depth) * torch.exp(-before)
+
+
+def ray_depth(
+    distances: Float[Tensor, "r s"], weights: Float[Tensor, "r s"], kind: DepthKind
+) -> Float[Tensor, " r"]:
+    """How far rays see: the sum of w_i d_i, the mean, or the first distance up to which half is seen, 0 without.
+
+    Example:
+        >>> seen = torch.tensor([[1.0, 2.0, 4.0]]), torch.tensor([[0.25, 0.25, 0.3]])
+        >>> [ray_depth(*seen, kind).item() for kind in ("accumulated", "expected", "median")]
+        [1.9500000476837158, 2.4375, 2.0]
+    """
+    if kind == "median":
+        reached = weights.cumsum(dim=-1) >= 0.5
+        first = distances.gather(1, reached.int().argmax(dim=1, keepdim=True))[:, 0]
+        return torch.where(reached.any(dim=1), first, 0.0)
+    total = (weights * distances).sum(dim=1)
+    return total if kind == "accumulated" else total / weights.sum(dim=1).clamp_min(1e-9)
 
 
 def spread(edges: Float[Tensor, "r c"], weights: Float[Tensor, "r k"]) -> Float[Tensor, ""]:

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vlgs.fields import Field, FieldImages, require_outputs
-from vlgs.types import Camera
+from vlgs.fields import Field, FieldImages, depth_of, require_outputs
+from vlgs.types import Camera, DepthKind
 
 
 class SeveralFields:
@@ -70,3 +70,7 @@ class SeveralFields:
             for field, part in zip(self.fields, parts, strict=True)
         ]
         return torch.cat(found)
+
+    def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+        """See `HasDepth`: that of the first, as colour is."""
+        return depth_of(self.fields[0], camera, kind)

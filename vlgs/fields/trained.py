@@ -12,7 +12,8 @@ from vlgs.fields import Field, FieldImages, PointCloud, require_outputs
 from vlgs.fields.cloud import point_cloud
 from vlgs.fields.similarity import decoded_cosines, rendered_feature
 from vlgs.fields.splat import FusedGaussians, SplatModel
-from vlgs.types import Camera
+from vlgs.ops.depth import render_depth
+from vlgs.types import Camera, DepthKind
 
 
 class SplatField:
@@ -94,6 +95,20 @@ class SplatField:
     ) -> Float[Tensor, "h w c"]:
         """See `HasGaussians`; in the shapes of language."""
         return self.model.render_values(camera, values, weight)
+
+    @torch.no_grad()
+    def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
+        """See `HasDepth`: of what blends colour; of language, at the first level, where no colour was trained."""
+        gaussians = self._fused.gaussians
+        shape, weight = gaussians, gaussians.opacities
+        if not self.color:
+            shape = gaussians.language_shape or gaussians
+            weight = self._fused.language_weight
+            weight = weight if weight.dim() == 1 else weight[:, 0].contiguous()
+        return render_depth(
+            gaussians.means, shape.quats, shape.scales, weight,
+            camera.viewmat, camera.K, camera.width, camera.height, self.model.raster, kind,
+        )  # fmt: skip
 
     def point_cloud(self, cameras: Sequence[Camera]) -> PointCloud:
         """See `HasGaussians`; the codes of all levels, whichever is asked."""

@@ -7,14 +7,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vlgs.fields import NO_GAUSSIANS, Field, HasGaussians, gaussians_of
+from vlgs.fields import NO_GAUSSIANS, Field, FieldImages, HasGaussians, gaussians_of
 from vlgs.metrics.segment import blend, smooth
 from vlgs.query import Query, Questions
 from vlgs.report.answer import answer_view
+from vlgs.report.pictures import spread
 from vlgs.types import Camera
 
 LEAST = 1 / 255
 """Weight under which a Gaussian is not drawn."""
+SHARE = 0.7
+"""Of a word's range of relevancy, above which a pixel answers: the top 30 % are LERF-OVS's, of one view."""
+_LOOKED_AT = 8
+"""Photographs' cameras from which a range is found."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Answers:
 
 
 def tie(query: Query, count: int) -> float:
-    """Relevancy at which a word is no better than what it is compared with: the default threshold.
+    """Relevancy at which a word is no better than what it is compared with.
 
     Args:
         query: How relevancy is computed.
@@ -48,9 +53,18 @@ def tie(query: Query, count: int) -> float:
 
 
 @torch.no_grad()
-def ask_view(field: Field, camera: Camera, asked: Questions) -> Answers:
-    """Look from a camera, and ask for all words at once."""
-    answer = answer_view(field, camera, asked.prompts)
+def ask_view(
+    field: Field, camera: Camera, asked: Questions, seen: FieldImages | None = None
+) -> Answers:
+    """Look from a camera, and ask for all words at once.
+
+    Args:
+        field: The trained scene.
+        camera: Where to look from.
+        asked: The words.
+        seen: What the field rendered for this camera, with colour; None: it is rendered.
+    """
+    answer = answer_view(field, camera, asked.prompts, seen)
     assert answer.cosines is not None  # there are prompts
     assert answer.negatives is not None
     both = zip(answer.cosines, answer.negatives, strict=True)
@@ -58,6 +72,44 @@ def ask_view(field: Field, camera: Camera, asked: Questions) -> Answers:
     relevancy = torch.stack([blend(level, smooth(level)) for level in maps])
     scores = relevancy.flatten(2).amax(dim=2)
     return Answers(asked.prompts.names, answer.color, relevancy, scores)
+
+
+@dataclass(frozen=True)
+class Range:
+    """Relevancy of a word over a scene, the same for all views, so that it looks cold where it is not."""
+
+    low: float
+    high: float
+    tie: float
+    """See `tie`."""
+
+    def shares(self, relevancy: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
+        """From 0 at the lowest to 1 at the highest, as heat maps show it."""
+        return ((relevancy - self.low) / max(self.high - self.low, 1e-9)).clamp(0, 1)
+
+    def threshold(self, share: float = SHARE) -> float:
+        """Relevancy above which a pixel or a Gaussian answers: so far up in the range, and never below a tie."""
+        return max(self.low + share * (self.high - self.low), self.tie)
+
+
+def ranges(
+    field: Field, cameras: Sequence[Camera], asked: Questions, chosen: int | None = None
+) -> list[Range]:
+    """Of each word, over at most eight of the cameras.
+
+    Args:
+        field: The trained scene.
+        cameras: Of photographs, at least one; held-out ones are not too many and see all of the scene.
+        asked: The words.
+        chosen: Place of the mask level; None: the best of each view.
+    """
+    answers = [ask_view(field, camera, asked) for camera in spread(cameras, _LOOKED_AT)]
+    least, found = tie(asked.query, len(asked.prompts.names)), []
+    for word in range(len(asked.prompts.names)):
+        maps = [answer.relevancy[answer.level(word, chosen), word] for answer in answers]
+        low, high = min(float(m.min()) for m in maps), max(float(m.max()) for m in maps)
+        found.append(Range(low, high, least))
+    return found
 
 
 @torch.no_grad()
@@ -72,7 +124,7 @@ def select_gaussians(
         field: The trained scene.
         asked: The words.
         word: Which of them.
-        threshold: Of the relevancy; see `tie`.
+        threshold: Of the relevancy; see `Range.threshold`.
         level: Place of the mask level; None: the one whose chosen Gaussians are the most relevant on average.
 
     Returns:

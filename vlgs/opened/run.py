@@ -44,6 +44,25 @@ class OpenedRun:
         """Where photographs were taken: of one split, ``train`` or ``test``, or all."""
         return [one for one in self.notes.cameras if split in (None, one.split)]
 
+    def held_out(self) -> Sequence[NamedCamera]:
+        """Cameras of held-out photographs; where there are none, all."""
+        return self.cameras("test") or self.cameras()
+
+    def place(self, level: int) -> int:
+        """Place of a mask level among those of the field.
+
+        Raises:
+            ValueError: If the run has no such level.
+        """
+        if level not in self.notes.levels:
+            known = (
+                ", ".join(map(str, self.notes.levels))
+                if self.notes.levels[0] is not None
+                else "none"
+            )
+            raise ValueError(f"{self.path}: level must be one of the run's, {known}, got {level}")
+        return self.notes.levels.index(level)
+
     def ask(self, words: Sequence[str]) -> Questions:
         """Words together with all that a query needs for them.
 

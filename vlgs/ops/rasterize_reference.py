@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
+from vlgs.types import Camera, ChannelGroup, DepthKind, RasterConfig, Rendered
 
 
 class _Splats(NamedTuple):
@@ -36,9 +36,7 @@ def rasterize(
 ) -> Rendered:
     """Image, accumulated weight and gradients as `vlgs.rasterize` defines them (Eqs. 1 and 6)."""
     splats = _project(means, quats, scales, camera, config)
-    front_to_back = torch.argsort(splats.depth, stable=True)
-    front_to_back = front_to_back[splats.in_front[front_to_back]]
-
+    front_to_back = _front_to_back(splats)
     images, alphas = [], []
     visible = torch.zeros_like(splats.in_front)
     for group in groups:
@@ -48,15 +46,36 @@ def rasterize(
             shape, order = own._replace(mean2d=splats.mean2d), order[own.in_front[order]]
         if not group.shape_grad:
             shape = _Splats(*(t.detach() for t in shape))
-        exponent = _exponent(shape, order, camera.width, camera.height)
-        alpha = group.weight[order, None] * torch.exp(-exponent)
-        reaches = alpha >= config.alpha_min
-        visible[order] |= reaches.any(dim=1)
-        alpha = torch.where(reaches, alpha.clamp(max=config.alpha_max), 0)
+        alpha = _alpha(shape, order, group.weight, camera, config)
+        visible[order] |= alpha.any(dim=1)
         image, accumulated = _blend(alpha, group.values[order], config)
         images.append(image.unflatten(0, (camera.height, camera.width)))
         alphas.append(accumulated.unflatten(0, (camera.height, camera.width)))
     return Rendered(tuple(images), tuple(alphas), visible, splats.mean2d)
+
+
+def render_depth(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, " n"],
+    camera: Camera,
+    config: RasterConfig,
+    kind: DepthKind,
+) -> Float[Tensor, "h w"]:
+    """Depth and gradients as `vlgs.ops.depth.render_depth` defines them."""
+    splats = _project(means, quats, scales, camera, config)
+    order = _front_to_back(splats)
+    alpha, before = _stopped(_alpha(splats, order, opacities, camera, config), config)
+    if kind == "median":
+        weights = ((before > 0.5) & (before * (1 - alpha) <= 0.5)).to(alpha)
+    else:
+        weights = alpha * before
+    image = weights.T @ splats.depth[order]
+    if kind == "expected":
+        total = weights.sum(dim=0)
+        image = torch.where(total > 0, image / torch.where(total > 0, total, 1), 0)
+    return image.unflatten(0, (camera.height, camera.width))
 
 
 def _project(
@@ -103,6 +122,21 @@ def _rotations(quats: Float[Tensor, "n 4"], valid: Bool[Tensor, " n"]) -> Float[
     return torch.eye(3, dtype=quats.dtype) + 2 * (w[:, None, None] * cross + cross @ cross)
 
 
+def _front_to_back(splats: _Splats) -> Int[Tensor, " m"]:
+    """Rows that are not culled; ties in their own order."""
+    order = torch.argsort(splats.depth, stable=True)
+    return order[splats.in_front[order]]
+
+
+def _alpha(
+    splats: _Splats, order: Tensor, weight: Tensor, camera: Camera, config: RasterConfig
+) -> Float[Tensor, "m p"]:
+    """What each Gaussian covers of each pixel, if nothing lies before it."""
+    exponent = _exponent(splats, order, camera.width, camera.height)
+    alpha = weight[order, None] * torch.exp(-exponent)
+    return torch.where(alpha >= config.alpha_min, alpha.clamp(max=config.alpha_max), 0)
+
+
 def _exponent(splats: _Splats, order: Tensor, width: int, height: int) -> Float[Tensor, "m p"]:
     """Half the squared Mahalanobis distance of every pixel centre, pixels row by row."""
     y, x = torch.meshgrid(
@@ -120,9 +154,16 @@ def _blend(
     alpha: Float[Tensor, "m p"], values: Float[Tensor, "m c"], config: RasterConfig
 ) -> tuple[Float[Tensor, "p c"], Float[Tensor, " p"]]:
     """Front-to-back sum of ``values_i alpha_i prod_{j<i} (1 - alpha_j)`` and the accumulated weight."""
+    alpha, before = _stopped(alpha, config)
+    return (alpha * before).T @ values, 1 - torch.prod(1 - alpha, dim=0)
+
+
+def _stopped(
+    alpha: Float[Tensor, "m p"], config: RasterConfig
+) -> tuple[Float[Tensor, "m p"], Float[Tensor, "m p"]]:
+    """Alpha of what is drawn before a pixel is done, 0 behind it, and ``prod_{j<i} (1 - alpha_j)``."""
     after = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat([torch.ones_like(alpha[:1].new_ones(1, alpha.shape[1])), after])[:-1]
     # T never grows, so that "still above the threshold" is the whole of the stopping rule.
     live = (before if config.stop == "after" else after) > config.transmittance_min
-    alpha = torch.where(live, alpha, 0)
-    return (alpha * before).T @ values, 1 - torch.prod(1 - alpha, dim=0)
+    return torch.where(live, alpha, 0), before

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.fields import Field
+from vlgs.fields import Field, FieldImages
 from vlgs.query import Prompts
 from vlgs.types import Camera
 
@@ -26,15 +26,19 @@ class Answer:
 
 
 @torch.no_grad()
-def answer_view(field: Field, camera: Camera, prompts: Prompts | None) -> Answer:
+def answer_view(
+    field: Field, camera: Camera, prompts: Prompts | None, seen: FieldImages | None = None
+) -> Answer:
     """Render a view once and ask it once, for all prompts and negatives together.
 
     Args:
         field: The trained scene.
         camera: Where to look from.
         prompts: What is asked for, or None for the pictures alone.
+        seen: What the field rendered for this camera, with colour at least; None: it is rendered.
     """
-    seen = field.render(camera, frozenset({"color"}) | (field.outputs & {"feature"}))
+    if seen is None:
+        seen = field.render(camera, frozenset({"color"}) | (field.outputs & {"feature"}))
     assert seen.color is not None  # it was asked for
     cosines = negatives = None
     if prompts is not None:

@@ -106,7 +106,7 @@ def write_view(folder: Path, pictures: ViewPictures, names: Mapping[str, str]) -
         named[f"relevancy_{names[word]}"] = heat
     for name, picture in named.items():
         if picture is not None:
-            _save(folder / f"{name}.png", picture)
+            save_picture(folder / f"{name}.png", picture)
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:
@@ -115,7 +115,8 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     return [items[i * len(items) // count] for i in range(count)]
 
 
-def _save(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:
+def save_picture(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:
+    """Write a PNG, whole or not at all."""
     from PIL import (
         Image,
     )  # pycolmap must not be imported before it; whoever needs pycolmap sees to that

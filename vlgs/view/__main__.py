@@ -1,16 +1,14 @@
 """Look around in a trained scene, and ask it for words, in a browser: `python -m vlgs.view RUN`; see `--help`."""
 
 import argparse
-import sys
 import time
 import webbrowser
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from vlgs.config import MOST_THREADS
 from vlgs.extras import require_extra
-from vlgs.runs import STOPPED
+from vlgs.opened.commands import add_words, command, opened
 from vlgs.text import screen
 from vlgs.values import require_range
 
@@ -40,21 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--port", type=int, default=8080, help="0 is any that is free (%(default)s)"
     )
-    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="further words and vectors")
-    parser.add_argument(
-        "--text", metavar="MODEL", help="CLIP or SigLIP for words that no vocabulary has"
-    )
-    parser.add_argument("--threads", type=int, default=2, help="CPU threads (%(default)s)")
     parser.add_argument(
         "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser here"
     )
+    add_words(parser)
     args = parser.parse_args(arguments)
-    try:
+    with command():
         view(args)
-    except (ValueError, OSError) as error:
-        sys.exit(screen(f"error: {error}"))
-    except KeyboardInterrupt:
-        sys.exit(STOPPED)
 
 
 def view(args: argparse.Namespace) -> None:
@@ -64,23 +54,20 @@ def view(args: argparse.Namespace) -> None:
         ValueError: If a run cannot be opened, or an argument is wrong.
         OSError: If a file cannot be read, or the port is taken.
     """
-    require_range("view", 1, MOST_THREADS, threads=args.threads)
     require_range("view", 0, 65535, port=args.port)
     if len(args.runs) > 2:
         raise ValueError(f"view: runs must be one or two, got {len(args.runs)}")
     require_extra("viser", "viewer")
-    import torch
-
+    runs = [opened(args, folder) for folder in args.runs]
     from vlgs.opened import open_run
     from vlgs.view.server import Address, Server
     from vlgs.view.shown import Shown
     from vlgs.view.watch import Watch
 
-    torch.set_num_threads(args.threads)
-    opening = partial(open_run, vocabulary=args.vocabulary, text=args.text)
-    runs = [Shown(opening(folder)) for folder in args.runs]
-    watch = Watch(runs, opening)
-    server = Server(runs, Address(args.host, args.port))
+    shown = [Shown(run) for run in runs]
+    words = {"vocabulary": args.vocabulary, "text": args.text, "template": args.template}
+    watch = Watch(shown, partial(open_run, **words))
+    server = Server(shown, Address(args.host, args.port))
     try:
         names = " and ".join(str(folder) for folder in args.runs)
         print(screen(f"{server.address.url} shows {names}; Ctrl-C ends"), flush=True)

@@ -73,7 +73,7 @@ class Server:
         self._viser.request_share_url = _share_nothing
         self._viser.gui.configure_theme(show_share_button=False)
         self._viser.gui.main_panel.dock_right()
-        self._begin_at((runs[0].run.cameras("test") or self.cameras)[0])
+        self._begin_at(runs[0].run.held_out()[0])
         self._viser.on_client_connect(self._connected)
         self._viser.on_client_disconnect(self._disconnected)
 

@@ -5,19 +5,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Lock
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.fields import Field, FieldImages, gaussians_of
+from vlgs.fields import Field, FieldImages, HasDepth, depth_of, gaussians_of
 from vlgs.geometry import resize_camera
 from vlgs.metrics.segment import LANGSPLAT, Constants, blend, smooth
 from vlgs.opened import OpenedRun
-from vlgs.opened.answers import tie
+from vlgs.opened.answers import Range, tie
 from vlgs.query import Questions
 from vlgs.report.features import FeatureColors, fit_feature_colors
+from vlgs.report.pictures import spread
 from vlgs.types import Camera
 from vlgs.view.eye import part
 from vlgs.view.few import Few, Stale, ask_all, ask_few, few_pixels
@@ -36,15 +36,6 @@ _ANSWERS = 8
 """Words whose answers are kept for a camera."""
 _BAND = 1 << 13
 """Pixels of a field without Gaussians that are rendered before it is looked whether they are still wanted."""
-
-
-@runtime_checkable
-class HasDepth(Protocol):
-    """A field that knows distances."""
-
-    def depth(self, camera: Camera, kind: str) -> Float[Tensor, "h w"]:
-        """Camera z of what each pixel shows, 0 where nothing is."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -80,24 +71,6 @@ class _Small:
     camera: Camera
     scale: float
     kept: Kept
-
-
-@dataclass(frozen=True)
-class Range:
-    """Relevancy of a word over a scene, the same for all views, so that it looks cold where it is not."""
-
-    low: float
-    high: float
-    tie: float
-    """See `vlgs.opened.answers.tie`."""
-
-    def shares(self, relevancy: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """From 0 at the lowest to 1 at the highest."""
-        return ((relevancy - self.low) / max(self.high - self.low, 1e-9)).clamp(0, 1)
-
-    def threshold(self, share: float) -> float:
-        """Relevancy above which something answers: so far up in the range, and never below a tie."""
-        return max(self.low + share * (self.high - self.low), self.tie)
 
 
 class Shown:
@@ -206,7 +179,7 @@ class Shown:
 
     @torch.no_grad()
     def range(self, word: str, level: int | None) -> Range:
-        """Of a word that was learnt, over a few photographs' cameras, made small.
+        """`vlgs.opened.answers.ranges` of a word that was learnt, from fewer and smaller views.
 
         Args:
             word: The word.
@@ -235,8 +208,7 @@ class Shown:
 
     def depth(self, camera: Camera) -> Float[Tensor, "h w"]:
         """Camera z."""
-        assert isinstance(self.run.field, HasDepth)  # `outputs`
-        return self.run.field.depth(camera, "expected")
+        return depth_of(self.run.field, camera)
 
     def depths(self) -> tuple[float, float]:
         """Depths between which colours are spread: the 1st and 99th percentile of what a few cameras see."""
@@ -295,10 +267,8 @@ class Shown:
 
     def _small_cameras(self) -> list[tuple[Camera, float]]:
         """A few photographs' cameras with the factor by which they were made smaller."""
-        every = [one.camera for one in self.run.cameras("test") or self.run.cameras()]
-        chosen = every[:: max(len(every) // _VIEWS, 1)][:_VIEWS]
         small = []
-        for camera in chosen:
+        for camera in spread([one.camera for one in self.run.held_out()], _VIEWS):
             scale = min(_SMALL / max(camera.width, camera.height), 1.0)
             w, h = (max(round(side * scale), 1) for side in (camera.width, camera.height))
             small.append((resize_camera(camera, w, h), scale))

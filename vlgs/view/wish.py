@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from vlgs.opened.answers import SHARE
 from vlgs.view.eye import Eye
 
 Output = Literal[
@@ -26,7 +27,7 @@ class Wish:
     """What is asked for; empty: nothing."""
     level: int | None = None
     """Mask level that answers, as the data number them; None: the one with the best score."""
-    share: float = 0.7
+    share: float = SHARE
     """How far up in a word's range of relevancy the mask begins."""
     opacity: float = 0.65
     """Of what is painted over the picture."""
