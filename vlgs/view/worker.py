@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from threading import Condition, RLock, Thread
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from vlgs.view.few import Stale
 from vlgs.view.wish import Wish
@@ -25,6 +25,7 @@ class Stage(IntEnum):
     """A word is asked at every pixel."""
 
 
+@runtime_checkable
 class Artist(Protocol):
     """Draws for one browser."""
 
