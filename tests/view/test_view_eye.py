@@ -99,3 +99,8 @@ def test_an_eye_has_the_place_of_its_camera(shown: Shown):
     assert torch.allclose(torch.tensor(eye.position), camera_center(camera.viewmat), atol=1e-5)
     rotation = quat_to_rotmat(torch.tensor(eye.wxyz))
     assert torch.allclose(rotation, camera.viewmat[:3, :3].mT, atol=1e-5)
+
+
+def test_up_is_up_in_a_scene(shown: Shown):
+    around = surroundings([one.camera for one in shown.run.cameras()])
+    assert around.up[2] > 0.9  # the cameras look down at a table
