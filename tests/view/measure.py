@@ -38,10 +38,16 @@ class Arrivals:
         page.on("websocket", lambda socket: socket.on("framereceived", self._note))
 
     def _note(self, message: Any) -> None:
-        at = message.find(_START) if isinstance(message, bytes) else -1
+        import zstandard  # viser brings it
+
+        if not isinstance(message, bytes):
+            return
+        now, length = time.monotonic(), int.from_bytes(message[8:16], "little")
+        plain = zstandard.ZstdDecompressor().decompress(message[16 : 16 + length])
+        at = plain.find(_START)
         if at >= 0:
-            self.times.append(time.monotonic())
-            self.sizes.append(Image.open(io.BytesIO(message[at:])).size)
+            self.times.append(now)
+            self.sizes.append(Image.open(io.BytesIO(plain[at:])).size)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser here"
     )
+    parser.add_argument("--word", help="ask for it as soon as a browser comes")
     add_words(parser)
     args = parser.parse_args(arguments)
     with command():
@@ -65,9 +66,12 @@ def view(args: argparse.Namespace) -> None:
     from vlgs.view.watch import Watch
 
     shown = [Shown(run) for run in runs]
+    for one in shown:
+        if args.word is not None:
+            one.learn(args.word)  # what cannot be encoded is said before anything is served
     words = {"vocabulary": args.vocabulary, "text": args.text, "template": args.template}
     watch = Watch(shown, partial(open_run, **words))
-    server = Server(shown, Address(args.host, args.port))
+    server = Server(shown, Address(args.host, args.port), args.word)
     try:
         names = " and ".join(str(folder) for folder in args.runs)
         print(screen(f"{server.address.url} shows {names}; Ctrl-C ends"), flush=True)

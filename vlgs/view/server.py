@@ -51,14 +51,16 @@ class Server:
     Args:
         runs: One or two; who holds the list may replace them.
         address: Where to listen; port 0 is any that is free.
+        word: Asked for as soon as a browser comes.
 
     Raises:
         OSError: If that cannot be: the port is in use, or the host is not this machine.
     """
 
-    def __init__(self, runs: list[Shown], address: Address) -> None:
+    def __init__(self, runs: list[Shown], address: Address, word: str | None = None) -> None:
         self.runs = runs
         self.worker = Worker()
+        self.word = word
         self.cameras = list(runs[0].run.cameras())
         self.around = surroundings([one.camera for one in self.cameras])
         self._panels: dict[int, _Panel] = {}
@@ -99,6 +101,8 @@ class Server:
         panel = _Panel(client, self.runs, self.worker, self.cameras, self.around)
         self._panels[client.client_id] = panel
         panel.begin()
+        if self.word is not None:
+            panel.ask(self.word)
 
     async def _disconnected(self, client: viser.ClientHandle) -> None:
         self.worker.close(client.client_id)
@@ -178,7 +182,7 @@ class _Panel:
     def _listen(self) -> None:
         """What happens when a control is touched. Callbacks run in threads; what takes long disturbs nobody."""
         self.word.on_update(lambda _: self._typed())
-        self.known.on_update(lambda _: self._ask(self.known.value))
+        self.known.on_update(lambda _: self.ask(self.known.value))
         self.output.on_update(lambda _: self._wish(output=self.output.value))
         self.level.on_update(lambda _: self._wish(level=_number(self.level.value)))
         self.share.on_update(lambda _: self._wish(share=self.share.value))
@@ -198,9 +202,9 @@ class _Panel:
         text = self.word.value
         if "\n" in text:
             self.word.value = " ".join(text.split())
-            self._ask(self.word.value)
+            self.ask(self.word.value)
 
-    def _ask(self, word: str) -> None:
+    def ask(self, word: str) -> None:
         """Encode a word and show where it is; what is wrong with it is said on the screen."""
         word = word.strip()
         if not word or word == _NO_CAMERA or word == self.wish.word:
