@@ -67,6 +67,7 @@ def view(args: argparse.Namespace) -> None:
 
     shown = [Shown(run) for run in runs]
     for one in shown:
+        one.prepare()
         if args.word is not None:
             one.learn(args.word)  # what cannot be encoded is said before anything is served
     words = {"vocabulary": args.vocabulary, "text": args.text, "template": args.template}

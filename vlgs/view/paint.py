@@ -1,6 +1,6 @@
 """Pictures of what a browser asks for."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -36,8 +36,8 @@ class Picture:
     """What is sent to a browser."""
 
     pixels: UInt8[Tensor, "h w 3"]
-    answers: tuple[Answered, ...] = ()
-    """One for each run that was asked for a word."""
+    answers: tuple[Answered | None, ...] = ()
+    """One for each run; None where it was not asked for a word, or is not in the picture."""
 
 
 @torch.no_grad()
@@ -56,21 +56,22 @@ def paint(runs: list[Shown], wish: Wish, camera: Camera, effort: Effort) -> Pict
     w = camera.width
     if len(runs) == 1 or wish.layout == "one":
         pixels, answered = paint_one(runs[0], wish, camera, effort)
-        return Picture(pixels, (answered,) if answered else ())
+        return Picture(pixels, (answered, None)[: len(runs)])
     middle = round(wish.division * w) if wish.layout == "divided" else w // 2
     spans = [(0, middle), (middle, w)]
     if wish.layout == "beside":
         spans = [(w // 4, w // 4 + middle), (w // 4, w // 4 + w - middle)]
     elif middle < _THINNEST or w - middle < _THINNEST:
-        alone = runs[0] if middle > w // 2 else runs[1]
-        return paint([alone], replace(wish, layout="one"), camera, effort)
+        first = middle > w // 2
+        pixels, answered = paint_one(runs[0 if first else 1], wish, camera, effort)
+        return Picture(pixels, (answered, None) if first else (None, answered))
     parts = [
         paint_one(run, wish, part(camera, *span), effort)
         for run, span in zip(runs, spans, strict=True)
     ]
     pixels = torch.cat([pixels for pixels, _ in parts], dim=1)
     pixels[:, middle - 1 : middle + 1] = torch.tensor(_LINE, dtype=torch.uint8)
-    return Picture(pixels, tuple(answered for _, answered in parts if answered))
+    return Picture(pixels, tuple(answered for _, answered in parts))
 
 
 def paint_one(

@@ -152,7 +152,7 @@ class _Panel:
             "Known words", self._known(), visible=asks, hint="asked before, or of the scene"
         )
         self.output = gui.add_dropdown("Show", outputs)
-        levels = [level for level in first.run.notes.levels if level is not None]
+        levels = first.level_names
         self.level = gui.add_dropdown(
             "Mask level", [_BEST, *map(str, levels)], visible=asks and len(levels) > 1
         )

@@ -14,7 +14,9 @@ _BUDGETS = {Stage.COARSE: 0.04, Stage.SHARP: 1.0}
 """Seconds for a picture. While the camera moves: 15 pictures a second, and what a browser and the way to it need.
 When it rests only fields of rays are made to keep to it; Gaussians are drawn at full size."""
 _MOST = {Stage.COARSE: 1 << 11, Stage.SHARP: 1 << 13}
-"""Pixels at which a word is asked, of all mask levels together."""
+"""Pixels at which Gaussians are asked for a word, of all mask levels together; all in the end."""
+_MOST_RAYS = 1 << 11
+"""Likewise of a field of rays, which takes a millisecond for each (LERF asks at 30 scales), in one piece that cannot be given up."""
 
 
 @dataclass(frozen=True)
@@ -49,26 +51,31 @@ class Session:
         full = stage is Stage.EXACT or (quick and stage is Stage.SHARP)
         scale = 1.0 if full else pace.scale(eye.width * eye.height)
         camera = eye.camera(*(max(round(side * scale), 1) for side in (eye.width, eye.height)))
-        # A field without Gaussians would be asked for minutes, in one piece that cannot be given up.
-        most = None if stage is Stage.EXACT and quick else _MOST.get(stage, _MOST[Stage.SHARP])
-        effort = Effort(most, scale, stage is not Stage.COARSE, stale)
+        effort = Effort(_most(stage, quick), scale, stage is not Stage.COARSE, stale)
         began = time.perf_counter()
         picture = paint(runs, wish, camera, effort)
         seconds = time.perf_counter() - began
         pace.took(camera.width * camera.height, seconds)
         self.show(Frame(picture, stage, seconds))
-        approximate = quick and any(answered.approximate for answered in picture.answers)
+        approximate = quick and any(one is not None and one.approximate for one in picture.answers)
         return stage is Stage.COARSE or (stage is Stage.SHARP and (scale < 1 or approximate))
 
     def full(self, wish: Wish) -> Picture:
-        """The picture of a wish at its full size, with a word asked at every pixel."""
-        return paint(list(self.runs), wish, wish.eye.camera(), Effort(keep=True))
+        """The picture of a wish at its full size, as good as it can be."""
+        runs = list(self.runs)
+        effort = Effort(_most(Stage.EXACT, all(run.gaussians for run in runs)), keep=True)
+        return paint(runs, wish, wish.eye.camera(), effort)
 
     def _pace(self, wish: Wish, stage: Stage, quick: bool) -> Pace:
         key = (stage, wish.output, wish.layout, bool(wish.word))
         if key not in self._paces:
             self._paces[key] = Pace(_BUDGETS.get(stage, 0.0), 0.5 if quick else SMALLEST)
         return self._paces[key]
+
+
+def _most(stage: Stage, quick: bool) -> int | None:
+    """Pixels at which a word is asked; None: all."""
+    return _MOST.get(stage) if quick else _MOST_RAYS
 
 
 def describe(runs: Sequence[Shown], wish: Wish, frame: Frame) -> list[str]:
@@ -81,14 +88,9 @@ def describe(runs: Sequence[Shown], wish: Wish, frame: Frame) -> list[str]:
         lines.append(f"{run.run.path.name}: {count}{step}")
     lines.append(f"{w}x{h}, {1000 * frame.seconds:.0f} ms")
     for answered, run in zip(frame.picture.answers, runs, strict=False):
+        if answered is None:
+            continue
         about = "about " if answered.approximate else ""
-        level = level_name(run, answered.level)
-        lines.append(f"{wish.word}: {about}{answered.score:.3f}{level and ', level ' + level}")
+        level = f", level {run.level_names[answered.level]}" if run.level_names else ""
+        lines.append(f"{wish.word}: {about}{answered.score:.3f}{level}")
     return lines
-
-
-def level_name(run: Shown, place: int) -> str:
-    """A mask level as it is called in the data; empty where they have none."""
-    levels = run.run.notes.levels
-    level = levels[place] if place < len(levels) else None
-    return "" if level is None else str(level)

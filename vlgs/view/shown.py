@@ -34,7 +34,7 @@ _SAMPLED = 1024
 """Pixels of these that are asked."""
 _ANSWERS = 8
 """Words whose answers are kept for a camera."""
-_BAND = 1 << 13
+_BAND = 1 << 11
 """Pixels of a field without Gaussians that are rendered before it is looked whether they are still wanted."""
 
 
@@ -114,6 +114,11 @@ class Shown:
             return None
         own = {id(one.opacities()): len(one.opacities()) for one in self.gaussians}
         return sum(own.values())
+
+    def prepare(self) -> None:
+        """Render what the first word will need, unless that takes seconds."""
+        if self.gaussians is not None:
+            _ = self._small
 
     def learn(self, word: str) -> Questions:
         """The vectors of a word, looked up or encoded.
@@ -221,10 +226,15 @@ class Shown:
             self._depths = low, high
         return self._depths
 
+    @property
+    def level_names(self) -> tuple[int, ...]:
+        """Mask levels among which there is a choice, as the data number them, in the order of the field."""
+        known = [level for level in self.run.notes.levels if level is not None]
+        return tuple(known) if len(known) == len(self.levels) else ()
+
     def place(self, level: int | None) -> int | None:
         """Place of a mask level among those of the field; None where none was chosen, or the run has not this one."""
-        known = self.run.notes.levels[: len(self.levels)]
-        return known.index(level) if level is not None and level in known else None
+        return None if level not in self.level_names else self.level_names.index(level)
 
     def _ask(
         self, camera: Camera, kept: Kept, words: Tensor, most: int | None, stale: Wanted
