@@ -6,13 +6,17 @@ import urllib.request
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 from serving import serving
 
 from vlgs.extras import require_extra
 from vlgs.opened import open_run
 from vlgs.runs import STOPPED, RunFolder
 from vlgs.view.__main__ import main
+from vlgs.view.save import first_picture
 from vlgs.view.shown import Shown
 from vlgs.view.watch import Watch
 
@@ -61,6 +65,17 @@ def test_a_port_in_use_is_refused(folder: Path):
     assert f"port {port} of 127.0.0.1 must be free" in said
     assert "--port" in said
     assert "203.0.113.9 must be free" in refused(str(folder), "--host", "203.0.113.9")
+
+
+def test_the_first_picture_needs_no_browser_and_no_server(folder: Path, tmp_path: Path):
+    out = tmp_path / "first.png"
+    main([str(folder), "--word", "mug", "--picture", str(out)])
+    shown = Shown(open_run(folder))
+    shown.learn("mug")
+    want = first_picture([shown], "mug").pixels
+    assert torch.equal(torch.from_numpy(np.asarray(Image.open(out)).copy()), want)
+    assert "must end in .png" in refused(str(folder), "--picture", "first.jpg")
+    assert "'zeppelin'" in refused(str(folder), "--word", "zeppelin", "--picture", str(out))
 
 
 def test_it_serves_this_machine_only_and_ends_with_ctrl_c(folder: Path):

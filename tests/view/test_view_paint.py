@@ -2,26 +2,33 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.fields import Field, FieldImages, depth_of, gaussians_of
-from vlgs.opened.answers import ask_view, ranges
+from vlgs.fields import Field, FieldImages, HasGaussians, depth_of, gaussians_of
+from vlgs.gaussians import read_ply
+from vlgs.opened.answers import ask_view, ranges, select_gaussians
 from vlgs.report import colors
 from vlgs.report.indicator import indicator_difference
 from vlgs.types import Camera
 from vlgs.view.eye import Eye, part
 from vlgs.view.few import Stale, few_pixels
 from vlgs.view.paint import paint
+from vlgs.view.save import answering_ply
 from vlgs.view.session import Frame, Session, describe
 from vlgs.view.shown import Effort, Shown
 from vlgs.view.wish import OUTPUTS, Wish
 from vlgs.view.worker import Stage
 
 ALL = Effort(keep=True)
+
+
+def refuse(reason: str) -> None:
+    raise AssertionError(reason)
 
 
 def rendered(field: Field, camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -149,7 +156,7 @@ def test_another_word_or_threshold_renders_nothing(shown: Shown, eye: Eye):
     field = Counting(shown.run.field)
     watched = Shown(replace(shown.run, field=field))
     frames: list[Frame] = []
-    session = Session([watched], frames.append)
+    session = Session([watched], frames.append, refuse)
     watched.learn("mug")
     watched.learn("lemon")
     wish = Wish(eye, "relevancy", "mug")
@@ -208,7 +215,7 @@ def test_two_runs_share_one_picture(shown: Shown, eye: Eye):
 def test_two_browsers_do_not_disturb_each_other(shown: Shown, eye: Eye):
     """Each has its own camera, word and output, and a session of its own; what is kept of the one is not shown to the other."""
     frames: tuple[list[Frame], list[Frame]] = ([], [])
-    one, two = (Session([shown], own.append) for own in frames)
+    one, two = (Session([shown], own.append, refuse) for own in frames)
     shown.learn("mug")
     shown.learn("lemon")
     aside = replace(eye, position=(*eye.position[:2], eye.position[2] + 0.2))
@@ -225,7 +232,7 @@ def test_two_browsers_do_not_disturb_each_other(shown: Shown, eye: Eye):
 
 def test_the_status_says_what_is_shown(shown: Shown, eye: Eye):
     frames: list[Frame] = []
-    session = Session([shown], frames.append)
+    session = Session([shown], frames.append, refuse)
     shown.learn("mug")
     wish = Wish(eye, "mask", "mug")
     assert session.draw(wish, Stage.SHARP, lambda: False) is False  # so few pixels are all asked
@@ -243,3 +250,31 @@ def test_a_word_that_cannot_be_encoded_is_refused_in_words(shown: Shown):
     with pytest.raises(ValueError, match="--vocabulary FILE"):
         shown.learn("zeppelin")
     assert "zeppelin" not in shown.asked
+
+
+def test_a_picture_that_cannot_be_drawn_is_a_message(shown: Shown, eye: Eye):
+    said: list[str] = []
+    session = Session([shown], lambda _: pytest.fail("it was drawn"), said.append)
+    nowhere = replace(eye, position=(float("nan"), 0.0, 0.0))
+    assert session.draw(Wish(nowhere), Stage.SHARP, lambda: False) is False
+    assert len(said) == 1
+    assert "must be" in said[0]
+
+
+def test_what_answers_is_saved(shown: Shown, eye: Eye, tmp_path: Path):
+    shown.learn("mug")
+    wish = Wish(eye, "mask", "mug", share=0.5)
+    content, count = answering_ply(shown, wish)
+    path = tmp_path / "mug.ply"
+    path.write_bytes(content)
+    saved, every = read_ply(path), shown.run.field
+    threshold = shown.range("mug", None).threshold(0.5)
+    _, chosen = select_gaussians(every, shown.asked["mug"], 0, threshold, None)
+    assert isinstance(every, HasGaussians)
+    cloud = every.point_cloud([one.camera for one in shown.run.cameras("train")])
+    assert 0 < count == int(chosen.sum()) < len(chosen)
+    assert torch.equal(saved["means"], cloud.params["means"][chosen])
+    with pytest.raises(ValueError, match="none above a relevancy of"):
+        answering_ply(shown, replace(wish, share=9.0))
+    with pytest.raises(ValueError, match="a word must be asked"):
+        answering_ply(shown, Wish(eye))

@@ -6,11 +6,15 @@ import webbrowser
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vlgs.extras import require_extra
 from vlgs.opened.commands import add_words, command, opened
 from vlgs.text import screen
 from vlgs.values import require_range
+
+if TYPE_CHECKING:
+    from vlgs.view.shown import Shown
 
 _HELP = """The pictures are those of vlgs.render and vlgs.query: relevancy as LERF-OVS measures it, the indicator, harmonics. They are coarse while
 the camera moves where the machine is too slow for all pixels. The middle of the window is the optical axis, also where a photograph's principal
@@ -42,6 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser here"
     )
     parser.add_argument("--word", help="ask for it as soon as a browser comes")
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="OUT.png",
+        help="write what a browser sees first, and end; needs no browser",
+    )
     add_words(parser)
     args = parser.parse_args(arguments)
     with command():
@@ -58,18 +68,43 @@ def view(args: argparse.Namespace) -> None:
     require_range("view", 0, 65535, port=args.port)
     if len(args.runs) > 2:
         raise ValueError(f"view: runs must be one or two, got {len(args.runs)}")
-    require_extra("viser", "viewer")
+    if args.picture is None:
+        require_extra("viser", "viewer")
+    elif args.picture.suffix != ".png":
+        raise ValueError(f"view: --picture must end in .png, got {args.picture}")
     runs = [opened(args, folder) for folder in args.runs]
-    from vlgs.opened import open_run
-    from vlgs.view.server import Address, Server
     from vlgs.view.shown import Shown
-    from vlgs.view.watch import Watch
 
     shown = [Shown(run) for run in runs]
     for one in shown:
         one.prepare()
-        if args.word is not None:
-            one.learn(args.word)  # what cannot be encoded is said before anything is served
+    if args.word is not None:  # what cannot be encoded is said before anything is served
+        for one in [one for one in shown if one.run.field.has_language] or shown:
+            one.learn(args.word)
+    if args.picture is None:
+        serve(shown, args)
+        return
+    from vlgs.report.pictures import save_picture
+    from vlgs.view.save import first_picture
+
+    save_picture(args.picture, first_picture(shown, args.word).pixels)
+    print(screen(f"{args.picture}"))
+
+
+def serve(shown: list["Shown"], args: argparse.Namespace) -> None:
+    """Wait for browsers until Ctrl-C.
+
+    Args:
+        shown: The runs, which are replaced where there is a newer checkpoint.
+        args: Of the command line.
+
+    Raises:
+        OSError: If the port is taken.
+    """
+    from vlgs.opened import open_run
+    from vlgs.view.server import Address, Server
+    from vlgs.view.watch import Watch
+
     words = {"vocabulary": args.vocabulary, "text": args.text, "template": args.template}
     watch = Watch(shown, partial(open_run, **words))
     server = Server(shown, Address(args.host, args.port), args.word)

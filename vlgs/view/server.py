@@ -2,6 +2,7 @@
 
 import io
 import socket
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -10,13 +11,11 @@ import rich
 import viser
 from PIL import Image
 
-from vlgs.fields import NO_GAUSSIANS
-from vlgs.gaussians.ply import encode_ply
 from vlgs.names import file_names
 from vlgs.opened import NamedCamera
-from vlgs.opened.answers import select_gaussians
 from vlgs.text import markdown
 from vlgs.view.eye import Eye, Surroundings, eye_of, surroundings
+from vlgs.view.save import answering_ply
 from vlgs.view.session import Frame, Session, describe
 from vlgs.view.shown import Shown
 from vlgs.view.wish import ASKING, LAYOUTS, OUTPUTS, Wish
@@ -27,6 +26,10 @@ _QUALITY = {Stage.COARSE: 75, Stage.SHARP: 92, Stage.EXACT: 92}
 _LABEL = "vlgs"
 _BEST = "best"
 _NO_CAMERA = "-"
+_READING = 0.5
+"""Seconds that a line stands at least while the camera moves."""
+_LARGEST = 4096
+"""Pixels along a side of a picture; a larger window is filled by fewer."""
 _HISTORY = 12
 """Words that are remembered before those that the scene knows."""
 
@@ -125,9 +128,10 @@ class _Panel:
         self.worker = worker
         self.cameras = {f"{one.split} {one.name}": one for one in cameras}
         self.around = around
-        self.session = Session(runs, self._send)
+        self.session = Session(runs, self._send, self._complain)
         self.wish = Wish(_eye_of(client.camera))
         self.history: list[str] = []
+        self._said = 0.0
         self._changing = Lock()
         self._add_controls()
 
@@ -212,7 +216,7 @@ class _Panel:
         try:
             notes = {run.learn(word).note for run in self.runs if run.run.field.has_language}
         except (ValueError, OSError) as error:
-            self.message.content = f"**error:** {markdown(str(error))}"
+            self._complain(str(error))
             return
         self.message.content = markdown(" ".join(sorted(notes - {""})))
         self.history = [word, *(one for one in self.history if one != word)][:_HISTORY]
@@ -246,41 +250,37 @@ class _Panel:
         self.client.scene.set_background_image(
             pixels, format="jpeg", jpeg_quality=_QUALITY[frame.stage]
         )
-        if frame.stage is not Stage.COARSE:  # it would change faster than it can be read
+        now = time.monotonic()
+        if frame.stage is not Stage.COARSE or now - self._said > _READING:
+            self._said = now
             lines = describe(self.runs, self.wish, frame)
             self.status.content = "  \n".join(map(markdown, lines))
         self.client.flush()
 
+    def _complain(self, reason: str) -> None:
+        self.message.content = f"**error:** {markdown(reason)}"
+
     def _save_picture(self) -> None:
         wish, stream = self.wish, io.BytesIO()
-        with self.worker.alone:
-            picture = self.session.full(wish)
+        try:
+            with self.worker.alone:
+                picture = self.session.full(wish)
+        except ValueError as error:
+            self._complain(str(error))
+            return
         Image.fromarray(picture.pixels.numpy()).save(stream, "PNG")
         shown = wish.word if wish.word and wish.output in ASKING else wish.output
         self._download(f"{shown}.png", stream.getvalue())
 
     def _save_gaussians(self) -> None:
-        wish, shown = self.wish, self.runs[0]
+        wish = self.wish
         try:
-            if not wish.word or shown.gaussians is None:
-                what = "a word, got none" if shown.gaussians else f"Gaussians: {NO_GAUSSIANS}"
-                raise ValueError(f"view: what is saved must have {what}")
             with self.worker.alone:
-                level = shown.place(wish.level)
-                threshold = shown.range(wish.word, level).threshold(wish.share)
-                asked = shown.asked[wish.word]
-                own, chosen = select_gaussians(shown.run.field, asked, 0, threshold, level)
-                cloud = own.point_cloud([one.camera for one in shown.run.cameras("train")])
-            if not chosen.any():
-                raise ValueError(
-                    f"view: a Gaussian must answer {wish.word!r}, got none above a relevancy of {threshold:.3f}; a lower threshold chooses more"
-                )
-            params = {name: value[chosen] for name, value in cloud.params.items()}
-            content = encode_ply(params, notes=cloud.notes)
+                content, count = answering_ply(self.runs[0], wish)
         except ValueError as error:
-            self.message.content = f"**error:** {markdown(str(error))}"
+            self._complain(str(error))
             return
-        self.message.content = f"{int(chosen.sum()):,} Gaussians saved"
+        self.message.content = f"{count:,} Gaussians saved"
         self._download(f"{wish.word}.ply", content)
 
     def _download(self, name: str, content: bytes) -> None:
@@ -289,12 +289,14 @@ class _Panel:
 
 
 def _eye_of(camera: viser.CameraHandle) -> Eye:
+    w, h = max(int(camera.image_width), 1), max(int(camera.image_height), 1)
+    scale = min(_LARGEST / max(w, h), 1.0)
     return Eye(
         tuple(map(float, camera.position)),
         tuple(map(float, camera.wxyz)),
         float(camera.fov),
-        max(int(camera.image_width), 1),
-        max(int(camera.image_height), 1),
+        max(round(scale * w), 1),
+        max(round(scale * h), 1),
     )
 
 

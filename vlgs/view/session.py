@@ -35,11 +35,18 @@ class Session:
     Args:
         runs: One or two; who holds the list may replace them.
         show: Sends a picture.
+        complain: Says why there is none.
     """
 
-    def __init__(self, runs: list[Shown], show: Callable[[Frame], None]) -> None:
+    def __init__(
+        self,
+        runs: list[Shown],
+        show: Callable[[Frame], None],
+        complain: Callable[[str], None],
+    ) -> None:
         self.runs = runs
         self.show = show
+        self.complain = complain
         self._paces: dict[tuple[Stage, Output, Layout, bool], Pace] = {}
 
     def draw(self, wish: Wish, stage: Stage, stale: Callable[[], bool]) -> bool:
@@ -53,7 +60,11 @@ class Session:
         camera = eye.camera(*(max(round(side * scale), 1) for side in (eye.width, eye.height)))
         effort = Effort(_most(stage, quick), scale, stage is not Stage.COARSE, stale)
         began = time.perf_counter()
-        picture = paint(runs, wish, camera, effort)
+        try:
+            picture = paint(runs, wish, camera, effort)
+        except ValueError as error:  # such as a view that needs more memory than it may take
+            self.complain(str(error))
+            return False
         seconds = time.perf_counter() - began
         pace.took(camera.width * camera.height, seconds)
         self.show(Frame(picture, stage, seconds))
