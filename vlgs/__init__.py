@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vlgs.ops.depth import render_depth as render_depth
     from vlgs.ops.rasterize import rasterize as rasterize
     from vlgs.types import Camera as Camera
     from vlgs.types import ChannelGroup as ChannelGroup
@@ -24,6 +25,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOME = {
     "rasterize": "vlgs.ops.rasterize",
+    "render_depth": "vlgs.ops.depth",
     "Camera": "vlgs.types",
     "ChannelGroup": "vlgs.types",
     "RasterConfig": "vlgs.types",
@@ -31,7 +33,9 @@ _HOME = {
     "Scene": "vlgs.types",
 }
 
-__all__ = ["Camera", "ChannelGroup", "RasterConfig", "Rendered", "Scene", "rasterize"]
+__all__ = [
+    "Camera", "ChannelGroup", "RasterConfig", "Rendered", "Scene", "rasterize", "render_depth",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -60,7 +60,9 @@ def as_today(recorded: DictConfig) -> DictConfig:
     for group in foreign:
         config[group] = {}  # the arguments of the default are not its own
     for key, value in AS_WITHOUT.items():
-        if value is not True and key not in before:
+        above = key.rpartition(".")[0]
+        there = not above or OmegaConf.select(config, above) is not None
+        if value is not True and key not in before and there:
             OmegaConf.update(config, key, value)
     merged = OmegaConf.merge(config, plain)
     assert isinstance(merged, DictConfig)

@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vlgs.known import OPEN, former, is_group, join, last, option, targets
 
-RESULTS_VERSION = 5
+RESULTS_VERSION = 6
 """Part of every run id; raised by a change that can move a number."""
 
 _MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
@@ -63,6 +63,7 @@ GIVEN_FILES = (("gaussians", "init"), ("head", "weights"))
 """Keys that name a file to start from: what is in it counts for a run's id (through the fingerprint), not where it lies."""
 
 AS_WITHOUT: Mapping[str, Any] = {
+    "data.faults.shared": 0,
     "gaussians.background": 0,
     "gaussians.codes": "none",
     "gaussians.codes_kept": 4,

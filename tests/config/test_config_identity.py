@@ -48,16 +48,16 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors": ("74db44fdd708523a", "6ad04c7204eb394f", "c332f65e94b1c03d"),
+    "data.scene=mirrors": ("cbb48f3055c16f1d", "fcbc1c6958b88ef0", "3c63531ff24cf4fc"),
     "levels=joint indicator=per_level fusion=none trainer=paper": (
-        "295b8e6568c9e5c9",
-        "bd3320272238caed",
-        "c332f65e94b1c03d",
+        "95fd7d65ceee6fc1",
+        "875e6f78ec568f58",
+        "3c63531ff24cf4fc",
     ),
     "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2": (
-        "681f0145d14df312",
-        "224d518c7a8831c1",
-        "d3ca131acb55689c",
+        "fa59105e142c0918",
+        "42c26c1806e27e11",
+        "361e0f7e8b0ed906",
     ),
 }
 """Overrides -> run id for a content called f, recipe, data recipe. Where numbers change too, `RESULTS_VERSION` is raised and these are

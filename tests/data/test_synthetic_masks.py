@@ -46,6 +46,28 @@ def test_missed_masks_leave_holes_at_their_rate():
     )  # 2160 masks: three standard deviations are 0.026
 
 
+def test_parts_are_missed_with_the_thing_they_are_of_at_the_shared_rate():
+    for shared, same in ((1.0, 1.0), (0.8, 0.8 + 0.2 * (0.7**2 + 0.3**2)), (0.0, 0.7**2 + 0.3**2)):
+        found = []
+        for _, subpart, part, whole in views(LabelNoise(0.3, 0.0, 0.0, 0.0, 0.0, shared)):
+            for finer in (part, subpart):
+                agree = (finer.index == -1) == (whole.index == -1)
+                found.append(agree.mean())
+        assert np.mean(found) == pytest.approx(same, abs=0.04)  # of 360 things
+
+
+def test_shared_fates_leave_whole_things_and_every_rate_as_they_were():
+    alone, together = (
+        views(LabelNoise(0.2, 0.1, 0.2, 0.3, 1.0, shared), 20) for shared in (0.0, 0.8)
+    )
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one[3].index, other[3].index)
+        assert np.array_equal(one[3].vectors, other[3].vectors)
+        assert not np.array_equal(one[2].index, other[2].index)
+    holes = [np.mean([(masks[1].index == -1).mean() for masks in each]) for each in (alone, together)]  # fmt: skip
+    assert holes[1] == pytest.approx(holes[0], abs=0.08)
+
+
 def test_mislabelled_masks_carry_another_class_at_their_rate():
     wrong = []
     for _, _, part, _ in views(LabelNoise(0.0, 0.0, 0.15, 0.0, 0.0)):
@@ -130,7 +152,7 @@ def test_impossible_faults_are_refused(rates):
 
 
 def test_a_rate_that_is_not_set_is_the_difficultys_own():
-    assert LabelNoise(noise=0.7).resolve("easy") == LabelNoise(0.05, 0.03, 0.05, 0.7, 1.0)
+    assert LabelNoise(noise=0.7).resolve("easy") == LabelNoise(0.05, 0.03, 0.05, 0.7, 1.0, 0.8)
     assert LabelNoise().resolve("hard").missed == 0.10
 
 

@@ -35,6 +35,7 @@ from vlgs.gaussians.logistic import logistic
 from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
+from vlgs.gsplat import rasterization
 from vlgs.heads.autoencoder import Autoencoder
 from vlgs.heads.classifier import Classifier
 from vlgs.heads.codebook import Codebook
@@ -69,7 +70,7 @@ from vlgs.types import Camera, ChannelGroup, DepthKind, Gaussians, RasterConfig
 from vlgs.view_blend import FixedBlend, blend_targets
 from vlgs.view_blend.pose import slerp
 
-AREAS = ("ops", "fields", "losses", "objectives", "geometry", "view_blend", "fusion", "gaussians", "heads", "query", "indicator")  # fmt: skip
+AREAS = ("ops", "fields", "losses", "objectives", "geometry", "view_blend", "fusion", "gaussians", "heads", "query", "indicator", "gsplat")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `interchange`) and protocols have no gradient; `module` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {
@@ -120,6 +121,7 @@ NO_GRADIENT = {
         "HasGaussians.gaussian_similarity", "HasGaussians.render_values",
     )},
     "vlgs.fields.gaussians_of": "returns its argument",
+    "vlgs.fields.saved.take_apart": "of what is trained",
     "vlgs.fields.planes.PlaneField.similarity": "training is over",
     **{f"vlgs.fields.planes.PlaneGaussians.{name}": "training is over" for name in (
         "opacities", "language_weights", "gaussian_similarity", "render_values",
@@ -141,6 +143,12 @@ NO_GRADIENT = {
     )},
     "vlgs.ops.rasterize_to_pixels.weights_alone": "the constants of a CachedView",
     "vlgs.ops.depth.median_rows": "picks rows",
+    "vlgs.gsplat.example.draw": "goes through what is checked",
+    "vlgs.gsplat.example.valid": "a mask",
+    "vlgs.gsplat.view.ViewSplats.rows": "picks rows",
+    "vlgs.gsplat.view.ViewSplats.detach": "takes the gradient away",
+    "vlgs.gsplat.absgrad.watch": "hands on what it gets (tests/gsplat)",
+    "vlgs.gsplat.absgrad.absolute_gradient": "a gradient itself",
     "vlgs.fields.HasDepth.depth": "protocol",
     **{f"vlgs.fields.{name}": "training is over" for name in (
         "depth_of", "trained.SplatField.depth", "hash_splat.HashSplatField.depth", "several.SeveralFields.depth",
@@ -200,6 +208,25 @@ def depths(kind: DepthKind, backend: str = "cpu") -> Check:
 
     opacities = 0.7 + 0.2 * s.weights[0]
     return image, [s.means, s.quats, 2 * s.scales, opacities]
+
+
+def by_gsplats_names() -> Check:
+    """Two cameras, antialiased, colour with a background and expected depth; cutoffs are where they are, and far enough."""
+    s = make_splats(5, seed=2, size=(6, 5), channels=(2,)).to(torch.float64)
+    viewmats = torch.eye(4).double().repeat(2, 1, 1)
+    viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.3])
+
+    def images(
+        means: Tensor, quats: Tensor, scales: Tensor, o: Tensor, colors: Tensor, behind: Tensor
+    ):
+        image, alpha, meta = rasterization(
+            means, quats, scales, o, colors, viewmats, view().K.repeat(2, 1, 1), 6, 5, backgrounds=behind,
+            render_mode="RGB+ED", rasterize_mode="antialiased",
+        )  # fmt: skip
+        return image, alpha, meta["means2d"], meta["opacities"], meta["depths"]
+
+    splats = [s.means, s.quats, 2 * s.scales, 0.5 + 0.4 * s.weights[0]]
+    return images, [*splats, s.values[0], draw(2, 2)]
 
 
 def shape_alone() -> Check:
@@ -416,6 +443,9 @@ CHECKS: dict[str, Callable[[], Check]] = {
         f"vlgs.ops.rasterize_reference.render_depth, {kind}": lambda kind=kind: depths(kind, "reference")
         for kind in get_args(DepthKind)
     },
+    "vlgs.gsplat.rendering.rasterization": by_gsplats_names,
+    "vlgs.gsplat.view.project_view": by_gsplats_names,
+    "vlgs.gsplat.view.compensation": by_gsplats_names,
     "vlgs.ops.depth.camera_depth": lambda: (lambda means: camera_depth(means, view()), [draw(3, 3)]),
     "vlgs.ops.depth.at_rows": lambda: (
         lambda values: at_rows(values, torch.tensor([[0, -1, 2], [2, 2, -1]])), [draw(3)]

@@ -21,6 +21,7 @@ from vlgs.training.build import Parts, build_module, scaled
 from vlgs.training.checkpoint import load_checkpoint
 from vlgs.training.fit import FitOptions
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.separate import for_language
 from vlgs.training.stages import Progress, run_stages
 from vlgs.training.workshop import Workshop
 from vlgs.types import Scene, View
@@ -170,3 +171,22 @@ def test_feature_3dgs_loss_is_that_of_decoded_pixels(gaps: Scene, pixels: str):
         over = there.sum() if pixels == "valid" else there.numel()
         term = done.terms[f"language {place}"].detach()
         assert float(term) == pytest.approx(float(error.detach().sum() / over), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "pruned_on"),
+    [
+        ((), "max"),
+        (("indicator=opacity",), "opacity"),
+        (("indicator=fixed", "indicator.value=0.5"), "opacity"),
+        (("gaussians.prune_on=opacity",), "opacity"),
+    ],
+)
+def test_a_weight_that_nothing_trains_keeps_no_gaussian_alive(
+    tiny_scene: Scene, overrides: tuple[str, ...], pruned_on: str
+):
+    parts = construct(composed(*TINY, *overrides)).make_parts()
+    assert build_module(tiny_scene, parts, 0).densifying.config.prune_on == pruned_on
+    alone = for_language(parts)
+    made = build_module(tiny_scene, alone, 0, color=False)
+    assert made.densifying.config.prune_on == "indicator"

@@ -17,6 +17,8 @@ from vlgs.ops.rasterize import rasterize
 from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, ChannelGroup, Gaussians, RasterConfig
 
+_ANYWHERE = torch.zeros(3)
+
 
 @dataclass(frozen=True)
 class FusedGaussians:
@@ -202,7 +204,7 @@ class SplatModel(nn.Module):
 
     def _eye(self, camera: Camera) -> Float[Tensor, " 3"]:
         """Where colour is seen from; of degree 0 it is the same from anywhere, and the centre is not looked for."""
-        return camera_center(camera.viewmat) if self.sh_degree else camera.viewmat.new_zeros(3)
+        return camera_center(camera.viewmat) if self.sh_degree else _ANYWHERE
 
     def _fuse_as_seen(
         self, gaussians: Gaussians, camera: Camera

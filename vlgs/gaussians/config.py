@@ -126,7 +126,8 @@ class GaussiansConfig:
     """Sparse points beyond this are left out, and densification stops growing here."""
     prune_on: Literal["max", "opacity", "indicator"] = "max"
     """``max``: a Gaussian lives while its opacity or its indicator is high (glass); ``opacity`` is the literal
-    reading of the paper (conf/README.md, D.10); ``indicator`` is for Gaussians of language alone."""
+    reading of the paper (conf/README.md, D.10); ``indicator`` is for Gaussians of language alone. An indicator that nothing trains
+    does not count (`vlgs.training.build.pruned_on`)."""
     init: str | None = None
     """File of Gaussians to start from (`vlgs.formats.read_gaussians`); None starts from the sparse points."""
     densify_on: Literal["total", "rgb"] = "total"

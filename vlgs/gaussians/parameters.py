@@ -12,6 +12,8 @@ from vlgs.types import Covariance, Gaussians
 Parameters = nn.ParameterDict | Mapping[str, Tensor]
 """Name of an attribute -> [n, ...]; row i of every one of them is Gaussian i."""
 
+_NEEDED = {*THREE_DGS, "features", "indicator_logits"}
+
 
 def activate(params: Parameters, attributes: Attributes = STANDARD) -> Gaussians:
     """Gaussians in natural units: scales by exp, opacities and indicators by the logistic function.
@@ -23,10 +25,11 @@ def activate(params: Parameters, attributes: Attributes = STANDARD) -> Gaussians
     Raises:
         ValueError: If a key is missing.
     """
-    needed = [*THREE_DGS, "features", "indicator_logits"]
-    missing = [name for name in needed if name not in params]
-    if missing:
-        raise ValueError(f"gaussians: parameters must have {', '.join(needed)}, got no {missing}")
+    if not params.keys() >= _NEEDED:
+        missing = sorted(_NEEDED - params.keys())
+        raise ValueError(
+            f"gaussians: parameters must have {', '.join(sorted(_NEEDED))}, got no {missing}"
+        )
     natural = {name: attributes[name].activate(value) for name, value in params.items()}
     shape = None
     if "language_quats" in natural:

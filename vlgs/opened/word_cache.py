@@ -18,7 +18,7 @@ from vlgs.query.text import ClipText
 
 
 def cache_folder() -> Path:
-    """Where vectors are kept: ``vlgs/words`` below XDG_CACHE_HOME, or ~/.cache."""
+    """Where vectors are kept: a folder of ours below XDG_CACHE_HOME, or ~/.cache."""
     home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(home).expanduser() / "vlgs" / "words"
 

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -100,9 +101,8 @@ def build_module(
             head.fit(scene.mask_vectors, scene.mask_areas)
     else:
         log.info("no language supervision: training colour only, without fusion or blended views")
-        # Indicators that nothing trains would keep every Gaussian alive.
         fusion = NoFusion()
-        config = replace(config, prune_on="opacity")
+    config = replace(config, prune_on=pruned_on(config, parts.indicator, scene, color))
     width = head.dim * scene.mask_levels
     language = scene.mask_vectors.shape[0] > 0
     own = language and parts.sharing.own_shape
@@ -138,6 +138,17 @@ def build_module(
     elif config.init_features == "random" and language:
         _randomise(model.splats["features"], seed)
     return module
+
+
+def pruned_on(
+    config: GaussiansConfig, indicator: Indicator, scene: Scene, color: bool
+) -> Literal["max", "opacity", "indicator"]:
+    """The weights that decide whether a Gaussian lives: those of ``gaussians.prune_on`` that are trained.
+
+    An indicator that nothing trains stays where it starts, above the bound, and would keep every Gaussian alive.
+    """
+    trained = len(scene.mask_vectors) > 0 and not has(indicator, "untrained")
+    return config.prune_on if trained or not color else "opacity"
 
 
 @torch.no_grad()

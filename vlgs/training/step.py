@@ -1,9 +1,9 @@
 """One iteration up to the gradients: two real views, whatever the objectives need of them, and their terms (Eq. 12)."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from statistics import fmean
 
 import torch
@@ -91,16 +91,14 @@ class TrainingStep:
         )
         again = partial(self.model.render, fused=fused)
         seen = StepView(step, pair, targets, (first, second), fused, again)
-        total, color = torch.zeros(()), torch.zeros(())
         terms: dict[str, Tensor] = {}
+        of_color: list[Tensor] = []
         for objective in self.setup.objectives.values():
             own = objective(seen)
-            for term in own.values():
-                total = total + term
-                if objective.needs == COLOR:
-                    color = color + term
+            if objective.needs == COLOR:
+                of_color += own.values()
             terms |= own
-        return Forward(seen, total, color, terms)
+        return Forward(seen, _sum(terms.values()), _sum(of_color), terms)
 
     def backward(self, forward: Forward) -> tuple[Float[Tensor, "n 2"], ...]:
         """Gradients of everything; returns those of the screen positions, per view, that feed densification."""
@@ -122,7 +120,7 @@ class TrainingStep:
 
     def render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
         """A training view in all that is needed of it; a view without language in colour alone."""
-        color, further = "color" in self.needs, tuple(sorted(self.needs - {"color", "feature"}))
+        color, further = "color" in self.needs, self._further
         language = ("feature" in self.needs and target.has_language) or not (color or further)
         camera = target.view.camera
         if self.frozen is not None and not further:
@@ -153,7 +151,18 @@ class TrainingStep:
             if isinstance(part, nn.Module) and next(part.parameters(), None) is not None
         }
 
+    @cached_property
+    def _further(self) -> tuple[str, ...]:
+        """Attributes beside colour and language that objectives need rendered."""
+        return tuple(sorted(self.needs - {"color", "feature"}))
+
     def _exposed(self, index: int, render: ViewRender) -> ViewRender:
         if self.exposure is None or render.color is None:
             return render
         return replace(render, color=self.exposure(index, render.color))
+
+
+def _sum(terms: Collection[Float[Tensor, ""]]) -> Float[Tensor, ""]:
+    """In their order; zero without any."""
+    first, *others = terms or (torch.zeros(()),)
+    return reduce(torch.add, others, first)

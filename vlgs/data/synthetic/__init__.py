@@ -3,7 +3,7 @@
 How a scene is made. Everyday things (`props.yaml`) stand on a round table (`scenes/*.yaml`, or a file of the user: `scene_file`) in a lit
 room (`room`, `layouts`). An analytic ray tracer (`tracer`) photographs them from a walk around the table (`cameras`), with a class for every pixel that
 is exact at the pixel's centre. Sparse points are drawn on what the training views see (`points`). Language supervision is the exact
-segmentation, spoilt as SAM and CLIP spoil it, at known rates and independently in every view (`masks`), with vectors that
+segmentation, spoilt as SAM and CLIP spoil it, at known rates, independently in every view and alike at all levels (`masks`), with vectors that
 have the geometry of CLIP's (`language`).
 
 What each scene tests.
@@ -13,8 +13,11 @@ What each scene tests.
 * ``mirrors``: steel and mirrors. Colour moves with the viewer and glare moves with the lamp, language stays.
 * ``lookalikes``: eight different things of one red. Colour does not tell classes apart.
 * ``patchwork``: things of many colours each. Colour tells apart what is one.
+* ``wirework``: things of wire, one to four pixels wide. Most of what a pixel shows lies behind what it is of.
+* ``rows``: the same thing several times, and others of nearly its shape and colour between.
+* ``smallware``: things of a dozen pixels. Most of every picture is surroundings.
 
-Each also comes seen from elsewhere, as a scene of its own (`outdoors`): ``glassware_ring`` in the room, from a ring around the table;
+The first four also come seen from elsewhere, as scenes of their own (`outdoors`): ``glassware_ring`` in the room, from a ring around the table;
 ``glassware_sky`` from such a ring under a sky that has neither points nor masks; ``glassware_wall`` from an arc before a plain wall without
 points. Half of their held-out views lie between training views, a quarter beyond them and a quarter above.
 

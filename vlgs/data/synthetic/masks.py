@@ -8,6 +8,9 @@ the subparts are laid.
 Every mask meets at most one of three fates: it is missed, it is merged with a mask that it touches (and then both carry
 the mean of their vectors by area), or it is mislabelled. Borders are displaced by a smooth random field. All draws are
 functions of (seed, scene, view, level, mask), so that views err independently and a view does not depend on how many there are.
+
+Levels of one photograph do not err independently: what a segmenter overlooks, or an encoder takes for something else, it does so at
+any granularity. A part or a patch has the fate of the whole thing that it is of, at the rate `LabelNoise.shared`, and otherwise one of its own.
 """
 
 from collections.abc import Mapping
@@ -22,7 +25,8 @@ LEVELS = (1, 2, 3)
 """Subpart, part, whole; level 0 is made of them."""
 _SMALLEST = 5e-4  # share of the image below which a region gets no mask
 _FIELD_CELL = 6  # pixels between the knots of the border displacement
-_FATES, _NOISE, _BORDERS, _LAYING = range(4)  # purposes of draws
+_FATES, _NOISE, _BORDERS, _LAYING, _SHARED = range(5)  # purposes of draws
+_WHOLE = 3
 
 
 @dataclass(frozen=True)
@@ -39,11 +43,15 @@ class LabelNoise:
     """Length of the noise on a mask vector, relative to a text vector."""
     ragged: float | None = None
     """Root mean square displacement of borders, in pixels per axis."""
+    shared: float | None = None
+    """Share of parts and patches that are missed, merged or mislabelled as the whole thing is; 0: three levels err as three photographs would."""
 
     def __post_init__(self):
         rates = [r or 0.0 for r in (self.missed, self.merged, self.mislabelled)]
         if min(rates) < 0 or sum(rates) > 1:
             raise ValueError(f"LabelNoise: rates must be >= 0 with a sum <= 1, got {rates}")
+        if self.shared is not None and not 0 <= self.shared <= 1:
+            raise ValueError(f"LabelNoise: shared must be in [0, 1], got {self.shared}")
         for name, value in (("noise", self.noise), ("ragged", self.ragged)):
             if value is not None and not 0 <= value < 100:
                 raise ValueError(f"LabelNoise: {name} must be in [0, 100), got {value}")
@@ -51,8 +59,8 @@ class LabelNoise:
     def resolve(self, difficulty: str) -> "LabelNoise":
         """These faults with every None replaced by the value that belongs to ``easy`` or ``hard``."""
         own = {
-            "easy": LabelNoise(0.05, 0.03, 0.05, 0.3, 1.0),
-            "hard": LabelNoise(0.10, 0.06, 0.10, 0.6, 1.6),
+            "easy": LabelNoise(0.05, 0.03, 0.05, 0.3, 1.0, 0.8),
+            "hard": LabelNoise(0.10, 0.06, 0.10, 0.6, 1.6, 0.8),
         }
         filled = {
             k: v if v is not None else vars(own[difficulty])[k] for k, v in vars(self).items()
@@ -60,7 +68,7 @@ class LabelNoise:
         return LabelNoise(**filled)
 
 
-NO_NOISE = LabelNoise(0.0, 0.0, 0.0, 0.0, 0.0)
+NO_NOISE = LabelNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Exact masks with exact vectors."""
 
 
@@ -99,7 +107,9 @@ def view_masks(
         key: Seed, scene and number of the view: what the draws are functions of, besides the mask.
     """
     levels = {
-        level: _level_masks(regions[level], names[level], words, faults, (*key, level))
+        level: _level_masks(
+            regions[level], regions[_WHOLE], names[level], words, faults, (*key, level)
+        )
         for level in LEVELS
     }
     whole, part, subpart = levels[3], levels[2], levels[1]
@@ -118,6 +128,7 @@ def view_masks(
 
 def _level_masks(
     regions: Int[np.ndarray, "h w"],
+    wholes: Int[np.ndarray, "h w"],
     names: Mapping[int, Region],
     words: tuple[str, ...],
     faults: LabelNoise,
@@ -129,7 +140,7 @@ def _level_masks(
     areas = np.bincount(local.ravel(), minlength=numbers.size)
     present = areas >= _SMALLEST * ragged.size
 
-    draws = np.stack([np.random.default_rng([_FATES, *key, int(n)]).random(3) for n in numbers])
+    draws = _draws(numbers, _owners(regions, wholes), faults.shared or 0.0, key)
     bounds = np.cumsum([faults.missed or 0.0, faults.merged or 0.0, faults.mislabelled or 0.0])
     fate = np.searchsorted(
         bounds, draws[:, 0], side="right"
@@ -154,6 +165,31 @@ def _level_masks(
     kept = vectors[masks]
     kept /= np.maximum(np.linalg.norm(kept, axis=1, keepdims=True), 1e-12)
     return LevelMasks(rows[local], kept.astype(np.float32))
+
+
+def _owners(regions: Int[np.ndarray, "h w"], wholes: Int[np.ndarray, "h w"]) -> Mapping[int, int]:
+    """Region -> the whole thing that it is of. Regions lie inside of things, so that any pixel tells."""
+    numbers, first = np.unique(regions, return_index=True)
+    return dict(zip(numbers.tolist(), wholes.ravel()[first].tolist(), strict=True))
+
+
+def _draws(
+    numbers: Int[np.ndarray, " r"], owners: Mapping[int, int], shared: float, key: tuple[int, ...]
+) -> Float[np.ndarray, "r 3"]:
+    """What decides the fate of each region: numbers of its own, or those of the thing that it is of."""
+
+    def of(level: int, number: int) -> Float[np.ndarray, " 3"]:
+        return np.random.default_rng([_FATES, *key[:-1], level, number]).random(3)
+
+    def theirs(number: int) -> bool:
+        return np.random.default_rng([_SHARED, *key, number]).random() < shared
+
+    level = key[-1]
+    rows = [
+        of(_WHOLE, owners[n]) if level != _WHOLE and theirs(n) else of(level, n)
+        for n in numbers.tolist()
+    ]
+    return np.stack(rows)
 
 
 def _merge(

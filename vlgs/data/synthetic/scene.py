@@ -40,8 +40,8 @@ def load_scene(
     The same arguments give the same bits on one machine. See `vlgs.data.synthetic` for what the scenes are.
 
     Args:
-        scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``; with ``_ring``, ``_sky`` or ``_wall`` after it, seen from there.
-            Or the path of a scene file of your own (conf/data/README.md).
+        scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``; with ``_ring``, ``_sky`` or ``_wall`` after it, seen from there;
+            ``wirework``, ``rows`` or ``smallware``. Or the path of a scene file of your own (conf/data/README.md).
         difficulty: ``easy``, or ``hard``: half as many things again, occlusion, about twice the faults.
         width: Pixels.
         height: Pixels; the field of view is fixed horizontally.

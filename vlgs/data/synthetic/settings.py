@@ -49,9 +49,11 @@ class SceneSettings:
     def fingerprint(self, level: int) -> str:
         """Hash of the parameters, the content of a scene file among them, with faults as they come out, and of the generator's version."""
         sizes = (self.width, self.height, self.train_views, self.test_views)
-        faults = astuple(self.faults.resolve(self.difficulty))
-        content = (self.scene.key, self.difficulty, *sizes, self.seed, self.points, faults)
+        *faults, shared = astuple(self.faults.resolve(self.difficulty))
+        content = (self.scene.key, self.difficulty, *sizes, self.seed, self.points, tuple(faults))
         text = f"vlgs.data.synthetic {VERSION} {content} {level}"
+        if shared and level != 3:  # whole things have the fates that the others share
+            text += f" shared {shared}"
         if self.scene.outdoors:
             text += f" outdoors {outdoors.VERSION}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
