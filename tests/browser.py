@@ -50,13 +50,9 @@ def launched(graphics: bool = True, *flags: str) -> Iterator[Any]:
         graphics: Whether there is WebGL.
         flags: Further ones of Chromium's command line.
     """
-    if find_spec("playwright") is None:
-        pytest.skip("needs playwright: pip install 'vlgs[e2e]'")
-    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
-
     chosen = [*(_SOFTWARE if graphics else _NONE), *flags]
     sandbox = os.getuid() != 0  # Chromium's own refuses to run as root
-    with sync_playwright() as playwright:
+    with _driver() as playwright:
         browser = playwright.chromium.launch(
             executable_path=find_chromium(), args=chosen, chromium_sandbox=sandbox
         )
@@ -64,6 +60,28 @@ def launched(graphics: bool = True, *flags: str) -> Iterator[Any]:
             yield browser
         finally:
             browser.close()
+
+
+@contextmanager
+def _driver() -> Iterator[Any]:
+    """Playwright; there can be only one in a process, which all browsers share."""
+    if find_spec("playwright") is None:
+        pytest.skip("needs playwright: pip install 'vlgs[e2e]'")
+    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
+
+    if _DRIVERS:
+        yield _DRIVERS[-1]
+        return
+    with sync_playwright() as playwright:
+        _DRIVERS.append(playwright)
+        try:
+            yield playwright
+        finally:
+            _DRIVERS.clear()
+
+
+_DRIVERS: list[Any] = []
+"""The one that runs, if one does."""
 
 
 @dataclass
