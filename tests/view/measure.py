@@ -38,7 +38,7 @@ class Arrivals:
         page.on("websocket", lambda socket: socket.on("framereceived", self._note))
 
     def _note(self, message: Any) -> None:
-        import zstandard  # viser brings it
+        import zstandard  # pyright: ignore[reportMissingImports]  (viser brings it)
 
         if not isinstance(message, bytes):
             return

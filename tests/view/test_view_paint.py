@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fields import Field, FieldImages, HasGaussians, depth_of, gaussians_of
+from vlgs.fields.several import SeveralFields
 from vlgs.gaussians import read_ply
 from vlgs.opened.answers import ask_view, ranges, select_gaussians
 from vlgs.report import colors
@@ -40,6 +41,10 @@ def rendered(field: Field, camera: Camera) -> Float[Tensor, "h w 3"]:
 def test_all_outputs_are_offered(shown: Shown):
     assert shown.outputs == OUTPUTS
     assert shown.count == gaussians_count(shown.run.field)
+    two = Shown(replace(shown.run, field=Joint(shown.run.field)))
+    assert two.gaussians is not None
+    assert len(two.gaussians) == 2
+    assert two.count == shown.count  # two levels of the same Gaussians
 
 
 def gaussians_count(field: Field) -> int:
@@ -112,6 +117,29 @@ def test_few_pixels_answer_nearly_as_all_do(shown: Shown, eye: Eye):
     assert 0 < (few - exact).abs().mean() < 0.005
 
 
+def test_each_mask_level_answers_for_itself(shown: Shown, eye: Eye):
+    """Also where only one of them is chosen; both levels are the same here, and a place is that of the data's number."""
+    two = Shown(
+        replace(
+            shown.run,
+            field=Joint(shown.run.field),
+            notes=replace(shown.run.notes, levels=(2, 3)),
+        )
+    )
+    two.learn("mug")
+    shown.learn("mug")
+    one = shown.relevancy(eye.camera(), "mug", ALL)
+    both = two.relevancy(eye.camera(), "mug", ALL)
+    assert torch.equal(both, one.expand(2, -1, -1))
+    few = two.relevancy(eye.camera(), "mug", Effort(4000, keep=True))
+    assert 0 < (few - both).abs().mean() < 0.005
+    (answered,) = paint([two], Wish(eye, "mask", "mug", level=3), eye.camera(), ALL).answers
+    assert answered is not None
+    assert answered.level == 1
+    assert (two.place(2), two.place(1), two.place(None)) == (0, None, None)
+    assert shown.place(2) is None
+
+
 def test_pixels_of_one_cell_share_an_answer():
     codes = torch.tensor(
         [[[0.0, 0.0], [1.0, 1.0], [0.001, 0.0]], [[1.0, 0.999], [0.0, 1.0], [0, 1]]]
@@ -127,6 +155,13 @@ def test_codes_that_are_all_different_are_asked_on_a_grid():
     few = few_pixels(codes, 30)
     assert few.pixels.tolist() == [10 * y + x for y in range(0, 12, 2) for x in range(0, 10, 2)]
     assert few.stands_in[5, 7] == 2 * 5 + 3  # pixel (6, 4), in the third row and fourth column
+
+
+class Joint(SeveralFields):
+    """Two mask levels of one set of Gaussians."""
+
+    def __init__(self, field: Field) -> None:
+        super().__init__([field, field])
 
 
 class Counting:

@@ -19,7 +19,7 @@ def answering_ply(shown: Shown, wish: Wish) -> tuple[bytes, int]:
     Raises:
         ValueError: If there is no word, no Gaussians, or none that answers.
     """
-    if not wish.word:
+    if wish.word not in shown.asked:
         raise ValueError("view: a word must be asked before its Gaussians are saved, got none")
     if shown.gaussians is None:
         raise ValueError(f"view: what is saved must be Gaussians: {NO_GAUSSIANS}")

@@ -1,19 +1,19 @@
 """The web server and the controls on the screen: the one module that knows viser."""
 
 import io
-import socket
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import Lock
 
 import rich
-import viser
+import viser  # pyright: ignore[reportMissingImports]
 from PIL import Image
 
 from vlgs.names import file_names
 from vlgs.opened import NamedCamera
 from vlgs.text import markdown
+from vlgs.view.address import Address, in_use, require_free
 from vlgs.view.eye import Eye, Surroundings, eye_of, surroundings
 from vlgs.view.save import answering_ply
 from vlgs.view.session import Frame, Session, describe
@@ -34,20 +34,6 @@ _HISTORY = 12
 """Words that are remembered before those that the scene knows."""
 
 
-@dataclass(frozen=True)
-class Address:
-    """Where the viewer listens."""
-
-    host: str
-    port: int
-
-    @property
-    def url(self) -> str:
-        """What to open in a browser on this machine."""
-        host = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
-        return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
-
-
 class Server:
     """Serves runs to browsers until it is stopped.
 
@@ -61,19 +47,18 @@ class Server:
     """
 
     def __init__(self, runs: list[Shown], address: Address, word: str | None = None) -> None:
+        require_free(address)
         self.runs = runs
-        self.worker = Worker()
         self.word = word
         self.cameras = list(runs[0].run.cameras())
         self.around = surroundings([one.camera for one in self.cameras])
-        self._panels: dict[int, _Panel] = {}
-        _require_free(address)
         rich.reconfigure(quiet=True)  # what viser announces, the command says in its own words
         self._viser = viser.ViserServer(address.host, address.port, _LABEL, verbose=False)
+        self.worker = Worker()
         self.address = Address(address.host, self._viser.get_port())
         if address.port not in (0, self.address.port):
             self.stop()  # viser takes the next port where one is taken in between
-            raise _in_use(address, "taken by another program")
+            raise in_use(address, "taken by another program")
         # A page behind a public address of another company is no part of "this machine only".
         self._viser.request_share_url = _share_nothing
         self._viser.gui.configure_theme(show_share_button=False)
@@ -102,14 +87,12 @@ class Server:
     async def _connected(self, client: viser.ClientHandle) -> None:
         # In the loop of events, so that a browser's events come one after the other.
         panel = _Panel(client, self.runs, self.worker, self.cameras, self.around)
-        self._panels[client.client_id] = panel
         panel.begin()
         if self.word is not None:
             panel.ask(self.word)
 
     async def _disconnected(self, client: viser.ClientHandle) -> None:
         self.worker.close(client.client_id)
-        self._panels.pop(client.client_id, None)
 
 
 class _Panel:
@@ -175,8 +158,8 @@ class _Panel:
         self.division = gui.add_slider("Division", 0.0, 1.0, 0.01, 0.5, visible=two)
         self.picture = gui.add_button("Save picture", hint="PNG of what is shown")
         self.gaussians = gui.add_button(
-            "Save Gaussians", hint="PLY of those that answer the word",
-            visible=asks and first.gaussians is not None,
+            "Save Gaussians", hint="PLY of those of the first run that answer the word",
+            visible=first.run.field.has_language and first.gaussians is not None,
         )  # fmt: skip
         self.status = gui.add_markdown("")
         self.message = gui.add_markdown("")
@@ -311,27 +294,3 @@ def _three(values: Sequence[float]) -> tuple[float, float, float]:
 
 def _share_nothing(verbose: bool = True) -> None:
     del verbose
-
-
-def _require_free(address: Address) -> None:
-    """Refuse a port that cannot be listened on; viser would look for another one, or wait for ever.
-
-    Raises:
-        OSError: Says why.
-    """
-    try:
-        found = socket.getaddrinfo(
-            address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )
-        for family, kind, protocol, _, place in found:
-            with socket.socket(family, kind, protocol) as one:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                one.bind(place)
-    except OSError as error:
-        raise _in_use(address, error.strerror or str(error)) from error
-
-
-def _in_use(address: Address, why: str) -> OSError:
-    return OSError(
-        f"view: port {address.port} of {address.host} must be free, got: {why}; --port takes another one, 0 any that is free"
-    )

@@ -23,7 +23,7 @@ from vlgs.view.eye import part
 from vlgs.view.few import Few, Stale, ask_all, ask_few, few_pixels
 from vlgs.view.wish import OUTPUTS, Output
 
-Wanted = Callable[[], bool]
+IsStale = Callable[[], bool]
 """Says whether what is being drawn is no longer wanted."""
 
 _VIEWS = 4
@@ -48,7 +48,7 @@ class Effort:
     """Size of the picture by that of the one that it stands in for, whose smoothing it imitates."""
     keep: bool = False
     """Whether the camera rests, so that the next picture may need the same images."""
-    stale: Wanted = lambda: False
+    stale: IsStale = lambda: False
 
 
 @dataclass
@@ -107,13 +107,17 @@ class Shown:
         }
         return tuple(output for output in OUTPUTS if there[output])
 
-    @property
+    @cached_property
     def count(self) -> int | None:
         """Number of Gaussians, of all mask levels where each has its own; None where there are none."""
         if self.gaussians is None:
             return None
-        own = {id(one.opacities()): len(one.opacities()) for one in self.gaussians}
-        return sum(own.values())
+        different: list[Tensor] = []
+        for level in self.gaussians:
+            opacities = level.opacities()
+            if not any(opacities.equal(other) for other in different):
+                different.append(opacities)
+        return sum(map(len, different))
 
     def prepare(self) -> None:
         """Render what the first word will need, unless that takes seconds."""
@@ -138,7 +142,7 @@ class Shown:
         Raises:
             Stale: If they are no longer wanted.
         """
-        key = _key(camera)
+        key, language = _key(camera), language and "feature" in self.run.field.outputs
         kept = self._kept.get(key)
         if kept is None or (language and kept.images.feature is None):
             names = self.run.field.outputs & {"color", *(["feature"] if language else [])}
@@ -237,7 +241,7 @@ class Shown:
         return None if level not in self.level_names else self.level_names.index(level)
 
     def _ask(
-        self, camera: Camera, kept: Kept, words: Tensor, most: int | None, stale: Wanted
+        self, camera: Camera, kept: Kept, words: Tensor, most: int | None, stale: IsStale
     ) -> Float[Tensor, "levels k h w"]:
         feature = kept.images.feature
         if most is not None and feature is not None:
@@ -252,7 +256,7 @@ class Shown:
         return ask_all(self.run.field, camera, kept.images, words, stale)
 
     @torch.no_grad()
-    def _render(self, camera: Camera, names: frozenset[str], stale: Wanted) -> FieldImages:
+    def _render(self, camera: Camera, names: frozenset[str], stale: IsStale) -> FieldImages:
         rows = camera.height if self.gaussians else max(_BAND // camera.width, 1)
         if rows >= camera.height:
             return self.run.field.render(camera, names)
