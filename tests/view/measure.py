@@ -115,6 +115,15 @@ def moving(page: Any, arrived: Arrivals, server: Serving, seconds: float) -> tup
     return took, f"median size {median(widths):.0f}x{median(heights):.0f}"
 
 
+def take(page: Any, server: Serving, path: Path) -> None:
+    """A picture of the window at rest, without what viser says of a browser that has no GPU."""
+    for button in page.locator("button.mantine-Notification-closeButton").all():
+        button.click()
+    page.mouse.move(200, 200)
+    rest(page, server)
+    page.screenshot(path=path)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print; the load of the machine stands beside the figures."""
     parser = argparse.ArgumentParser(prog="python -m tests.view.measure", description=__doc__)
@@ -122,6 +131,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--words", nargs="+", default=["mug", "lemon", "orange", "wall"])
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("W", "H"))
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument(
+        "--screenshot", type=Path, metavar="OUT.png", help="the window after the last word"
+    )
     args = parser.parse_args(arguments)
     width, height = args.size
     firsts, words, moves, note = list[Took](), list[Took](), list[Took](), ""
@@ -135,6 +147,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 took, note = moving(page, arrived, server, 4.0)
                 moves.append(took)
                 words += [word(page, arrived, server, name) for name in args.words]
+                if args.screenshot is not None:
+                    take(page, server, args.screenshot)
     print(f"{args.run}, {width}x{height}, load {load:.1f} before, medians:")
     say("first picture after the address", firsts)
     say("a picture while the mouse moves", moves, note)
