@@ -45,24 +45,44 @@ def write_ply(
     dialect: Dialect = "vlgs",
     notes: Sequence[str] = (),
 ) -> None:
-    """Write raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
-
-    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator`` (one per mask level as ``indicator_0`` ...),
-    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ..., what `STANDARD` does not
-    have under its own name; readers that look properties up by name pass over them. The file is complete or the one before stays.
+    """Write what `encode_ply` makes of raw parameters. The file is complete or the one before stays.
 
     Args:
         path: The file; its folder must exist.
+        params: See `encode_ply`.
+        dialect: Likewise.
+        notes: Likewise.
+
+    Raises:
+        ValueError: See `encode_ply`.
+        OSError: If the file cannot be written.
+    """
+    write_atomically(Path(path), encode_ply(params, dialect, notes, who=f"ply {path}"))
+
+
+def encode_ply(
+    params: Parameters,
+    dialect: Dialect = "vlgs",
+    notes: Sequence[str] = (),
+    who: str = "ply",
+) -> bytes:
+    """Raw parameters as 3DGS viewers expect them: binary little-endian, float32, logits and logarithms.
+
+    Language codes follow as ``lang_0`` ..., the indicator's logit as ``indicator`` (one per mask level as ``indicator_0`` ...),
+    language's own covariances, where there are any, as ``language_scale_0`` ... and ``language_rot_0`` ..., what `STANDARD` does not
+    have under its own name; readers that look properties up by name pass over them.
+
+    Args:
         params: Raw parameters.
         dialect: ``3dgs`` leaves out what 3DGS does not have, ``feature3dgs`` all of that but the codes, which it calls ``semantic_0`` ...
         notes: ASCII lines for the header, `PLAIN` first; without it, nobody knows whether the parameters wait for a fusion.
+        who: Begins an error.
 
     Raises:
         ValueError: If a value is not finite or a quaternion is zero; names the parameter and how many rows.
-        OSError: If the file cannot be written.
     """
     columns = {name: value.detach().to(torch.float32) for name, value in params.items()}
-    require_sound(f"ply {path}", columns)
+    require_sound(who, columns)
     named: dict[str, Tensor] = {}
     for name, row in _in_dialect(columns, dialect).items():
         if name not in columns:
@@ -80,7 +100,7 @@ def write_ply(
     stream = io.BytesIO()
     element = PlyElement.describe(vertices, "vertex")
     PlyData([element], byte_order="<", comments=notes).write(stream)
-    write_atomically(Path(path), stream.getvalue())
+    return stream.getvalue()
 
 
 def _in_dialect(names: Collection[str], dialect: Dialect) -> Attributes:
