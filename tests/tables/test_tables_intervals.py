@@ -33,7 +33,7 @@ def seeds_differ(scenes: int, seeds: int, spread: float, shared: float = 0.0) ->
     Args:
         scenes: How many.
         seeds: Of each.
-        spread: Deviation over seeds of the last scene; the first has 1, and others lie between.
+        spread: Deviation over seeds of the last scene; the others have 1.
         shared: Part of the variance that a seed gives to all scenes alike.
     """
     rng = np.random.default_rng(scenes + 10 * seeds)
@@ -41,7 +41,8 @@ def seeds_differ(scenes: int, seeds: int, spread: float, shared: float = 0.0) ->
     alone = rng.normal(size=(TRIALS, scenes, seeds))
     alike = rng.normal(size=(TRIALS, 1, seeds))
     noise = math.sqrt(1 - shared) * alone + math.sqrt(shared) * alike
-    return means[:, None] + np.linspace(1, spread, scenes)[:, None] * noise
+    deviations = np.array([1.0] * (scenes - 1) + [spread])
+    return means[:, None] + deviations[:, None] * noise
 
 
 def scenes_differ(scenes: int, seeds: int, spread: float) -> np.ndarray:
@@ -74,7 +75,7 @@ PRINTED = {
     "four scenes": (here, seeds_differ(4, 3, 1)),
     "four scenes, one four times as noisy": (here, seeds_differ(4, 3, 4)),
     "four scenes, seeds shared a little": (here, seeds_differ(4, 3, 1, shared=0.1)),
-    "eight scenes": (here, seeds_differ(8, 3, 3)),
+    "eight scenes, one three times as noisy": (here, seeds_differ(8, 3, 3)),
     "ten seeds": (here, seeds_differ(2, 10, 2)),
     "five scenes like these": (beyond, scenes_differ(FEWEST_SCENES, 3, 1)),
     "eight scenes like these": (beyond, scenes_differ(8, 3, 3)),
