@@ -259,12 +259,16 @@ def test_a_table_of_the_papers_scenes_is_another_elsewhere(tmp_path: Path):
     assert "The same runs as in tab:own" in (tmp_path / "synthetic" / "twin.md").read_text()
 
 
-def test_a_table_of_one_row_is_not_written(table: Table, tmp_path: Path):
-    skip = [(n, s, k) for n in ("Full", "Opacity") for s in BENCHMARK.scenes for k in (0, 1)]
-    fake_runs(tmp_path, [table], BENCHMARK, value, skip=skip)
+def test_what_stands_in_a_folder_is_written_again(table: Table, tmp_path: Path):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
     BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    other = replace(table, label="other")
     write_all(tmp_path, [table])
-    assert not (tmp_path / "synthetic" / "tiny.md").exists()
+    write_all(tmp_path, [table, other], again=True)
+    names = {path.name for path in (tmp_path / "synthetic").glob("*.md")}
+    assert names == {"tiny.md"}
+    write_all(tmp_path, [table, other])
+    assert (tmp_path / "synthetic" / "other.md").is_file()
 
 
 def test_runs_without_a_folder_stay_beside_new_ones(

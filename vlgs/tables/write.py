@@ -3,6 +3,7 @@
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
@@ -40,8 +41,8 @@ def write_all(
 
     Args:
         results: Folder of the runs and of the benchmarks.
-        tables: Which to write. One that has runs of fewer than two rows is left out, and so is one with options that the data of a
-            benchmark do not have (faults of the supervision, on photographs).
+        tables: Which to write. One without a single run is left out, and so is one with options that the data of a benchmark do not
+            have (faults of the supervision, on photographs). One that another stands for elsewhere is that one.
         name: Only the tables of this benchmark.
         html: Write index.html with its plots too, of these tables.
         again: In a folder that has some of the tables, write those only.
@@ -68,55 +69,75 @@ def write_all(
     tables = _with_those_elsewhere(tables)
     versions = sorted({line.results_version for line in lines}, reverse=True)
     frames = {v: tidy([line for line in lines if line.results_version == v]) for v in versions}
-    written: dict[Path, list[Filled]] = {}
-    refused: dict[str, UnknownOptionError] = {}
-    fitting: set[str] = set()
-    named: dict[tuple[str, str], str] = {}
+    found: dict[Path, _Found] = {}
     for file in files:
-        benchmark = Benchmark.read(file)
-        composer = Composer(benchmark, file.parent / "recipes.json")
-        filled: dict[str, Filled] = {}
-        wanted = tables
-        if again:
-            there = [t for t in tables if (file.parent / f"{t.label}.csv").is_file()]
-            wanted = there or tables
-        for version, frame in frames.items():
-            current = version == RESULTS_VERSION
-            recipes = composer if current else Recorded(benchmark, _recipes(frame))
-            for table in wanted:
-                if table.label in filled:  # with runs of a later version
-                    continue
-                try:
-                    found = fill(table, benchmark, recipes, frame)
-                    fitting.add(table.label)
-                except UnknownOptionError as error:
-                    composer.require_sound(file)
-                    refused[table.label] = error
-                    continue
-                if current:
-                    named |= _commands(table, benchmark, composer)
-                if _compares(found):
-                    filled[table.label] = found
-        if RESULTS_VERSION in frames:
-            composer.save()
-        written[file.parent] = [filled[t.label] for t in wanted if t.label in filled]
+        there = [t for t in tables if (file.parent / f"{t.label}.csv").is_file()]
+        found[file.parent] = _fill_all(file, there if again and there else tables, frames)
+    named = {run: command for one in found.values() for run, command in one.commands.items()}
     lines = [
         line._replace(overrides=named.get((line.recipe, line.data_recipe), line.overrides))
         for line in lines
     ]
     write_lines(lines, results)
-    for folder, found in written.items():
-        write_tables(folder, found)
+    for folder, one in found.items():
+        write_tables(folder, one.filled)
         if html:
             from vlgs.tables.html import (
                 write_report,  # matplotlib, which the tables alone do not wait for
             )
 
-            write_report(folder, found, tidy(lines), results)
-    for label in refused.keys() - fitting:
-        raise refused[label]
-    _say_older(written)
+            write_report(folder, one.filled, tidy(lines), results)
+    fitting = {label for one in found.values() for label in one.fitting}
+    for one in found.values():
+        for label in one.refused.keys() - fitting:
+            raise one.refused[label]
+    _say_older({folder: one.filled for folder, one in found.items()})
     return [file.parent for file in files]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a benchmark makes of the tables."""
+
+    filled: list[Filled]
+    """Those that are written."""
+    fitting: set[str] = field(default_factory=set)
+    """Labels of tables whose options its data has."""
+    refused: dict[str, UnknownOptionError] = field(default_factory=dict)
+    """Labels of the others, and why."""
+    commands: dict[tuple[str, str], str] = field(default_factory=dict)
+    """Recipe and data recipe of today's rows -> their overrides and the benchmark's."""
+
+
+def _fill_all(file: Path, tables: Sequence[Table], frames: Mapping[int, pd.DataFrame]) -> _Found:
+    """Each table from the first of the frames, by results version, that has runs of it."""
+    benchmark = Benchmark.read(file)
+    composer = Composer(benchmark, file.parent / "recipes.json")
+    filled: dict[str, Filled] = {}
+    found = _Found([])
+    for version, frame in frames.items():
+        current = version == RESULTS_VERSION
+        recipes = composer if current else Recorded(benchmark, _recipes(frame))
+        for table in tables:
+            if table.label in filled:
+                continue
+            try:
+                one = fill(table, benchmark, recipes, frame)
+            except UnknownOptionError as error:
+                composer.require_sound(file)
+                found.refused[table.label] = error
+                continue
+            if current or RESULTS_VERSION not in frames:  # earlier runs know no options
+                found.fitting.add(table.label)
+            if current:
+                found.commands.update(_commands(table, benchmark, composer))
+            elsewhere = table.elsewhere and not one.same_scenes
+            if len(one.runs) and not elsewhere:
+                filled[table.label] = one
+    if RESULTS_VERSION in frames:
+        composer.save()
+    found.filled.extend(filled[t.label] for t in tables if t.label in filled)
+    return found
 
 
 def _with_those_elsewhere(tables: Sequence[Table]) -> list[Table]:
@@ -125,14 +146,6 @@ def _with_those_elsewhere(tables: Sequence[Table]) -> list[Table]:
     needed = {t.elsewhere: Path(t.source).parent for t in tables if t.elsewhere}
     more = [load_table(folder / f"{n}.yaml") for n, folder in needed.items() if n not in labels]
     return [*tables, *more]
-
-
-def _compares(filled: Filled) -> bool:
-    """Whether a table has something to say: two of its rows have runs, unless it has but one, and no other says it of these scenes."""
-    if filled.table.elsewhere and not filled.same_scenes:
-        return False
-    rows = len({row.overrides for row in filled.table.rows})
-    return len(filled.runs[["recipe", "data_recipe"]].drop_duplicates()) >= min(2, rows)
 
 
 def _recipes(frame: pd.DataFrame) -> Iterator[tuple[str, str, str | None]]:
@@ -170,9 +183,11 @@ def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
         write_changed(stem.with_suffix(".csv"), to_bytes(to_csv(table)))
         write_changed(stem.with_suffix(".md"), to_bytes(to_markdown(table)))
         write_changed(stem.with_suffix(".tex"), to_bytes(to_latex(table)))
-        claims = claims_csv(table)
-        if claims is not None:
-            write_changed(folder / f"{table.table.label}-claims.csv", to_bytes(claims))
+        claims, path = claims_csv(table), folder / f"{table.table.label}-claims.csv"
+        if claims is None:
+            path.unlink(missing_ok=True)  # of runs that were more
+        else:
+            write_changed(path, to_bytes(claims))
     stems = (path.stem for path in folder.glob("*.tex"))
     labels = sorted(stem for stem in stems if stem != "tables" and is_label(stem))
     text = document(f"Ablations on {folder.name}", labels)
