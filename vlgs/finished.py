@@ -93,9 +93,13 @@ def _faults_within(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
         for key, value in (content.get(name) or {}).items():
             if not isinstance(value, str):
                 yield f"{name}.{key}", "a text", value
-    cpu = (content.get("machine") or {}).get("cpu")
-    if not isinstance(cpu, (str, type(None))):
-        yield "machine.cpu", "a text", cpu
+    machine = content.get("machine") or {}
+    for name in ("cpu", "isa"):
+        if not isinstance(machine.get(name), (str, type(None))):
+            yield f"machine.{name}", "a text", machine[name]
+    threads = machine.get("threads")
+    if threads is not None and (isinstance(threads, bool) or not isinstance(threads, int)):
+        yield "machine.threads", "a whole number", threads
     for name, entry in (content.get("skips") or {}).items():
         known = isinstance(entry, dict) and {"skipped", "share", "seconds_saved"} <= set(entry)
         if not known or not all(

@@ -109,7 +109,8 @@ def test_a_command_works_as_printed(command: str, tmp_path: Path):
     prepare(tmp_path)
     if "tables" in command:
         shutil.copytree(ROOT / "results/camvid", tmp_path / "results/camvid")
-        shutil.copy(ROOT / "results/runs.csv", tmp_path / "results")
+        for name in ("runs.csv", "categories.csv"):
+            shutil.copy(ROOT / "results" / name, tmp_path / "results")
     words = shlex.split(command)[1:]
     run([*words, *{GATED: SMOKE, **QUICK, **SLOW}[command]], tmp_path)
     if "gated" in command:

@@ -115,6 +115,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "runs/*0/queries.json": _runs,
     "runs/*0/config.yaml": _runs,
     "runs.csv": _tables,
+    "categories.csv": _tables,
     "synthetic/benchmark.yaml": _tables,
     "synthetic/recipes.json": _tables,
     "sweeps/tiny.yaml": _tables,
@@ -142,7 +143,7 @@ def _odd_values(name: str, sound: bytes) -> Iterator[tuple[str, bytes]]:
     """Every entry, and every entry of an entry, without its value or with an odd one."""
     if name.endswith("csv"):
         for word in ("nan", "inf", "1e999", "'", "=1", '"', "\r", "2.5"):
-            yield f"value {word}", sound.replace(b"0.5\n", word.encode() + b"\n", 1)
+            yield f"value {word}", sound.replace(b",0.5", b"," + word.encode(), 1)
             yield f"seed {word}", sound.replace(b",0,dense", f",{word},dense".encode(), 1)
         return
     if "recipes" in name:  # composing anew takes seconds

@@ -18,7 +18,7 @@ from vlgs.names import file_names
 from vlgs.report.summary import print_summary
 from vlgs.tables.benchmark import Benchmark
 from vlgs.tables.fill import Cell, Filled, Place
-from vlgs.tables.frame import Line, read_lines, tidy, write_frame
+from vlgs.tables.frame import Line, read_lines, tidy, write_lines
 from vlgs.tables.html import write_report
 from vlgs.tables.registry import Row, Table
 from vlgs.tables.runs import Run, compare
@@ -54,15 +54,17 @@ def _checked(check: Callable[[str, Path], None], name: str, folder: Path) -> Non
 
 
 def _runs_csv(name: str, folder: Path) -> None:
-    line = Line(name, name, name, name, name, 0, name, 2, name, name, name, name, name, -1.5)
-    write_frame(tidy([line]), folder)
-    text = (folder / "runs.csv").read_bytes().decode()
-    _no_formula(text)
-    assert list(csv.reader(io.StringIO(text, newline="")))[-1][-1] == "-1.5"
+    run = (name, name, name, name, name, 0, name, 2, name, name, name, 1, name)
+    lines = [Line(*run, name, "", "", -1.5), Line(*run, "per_category", name, name, -0.5)]
+    write_lines(lines, folder)
+    for file, value in (("runs.csv", "-1.5"), ("categories.csv", "-0.5")):
+        text = (folder / file).read_bytes().decode()
+        _no_formula(text)
+        assert list(csv.reader(io.StringIO(text, newline="")))[-1][-1] == value
     spelled = name.encode("utf-8", "backslashreplace").decode()
-    (read,) = read_lines(folder)
-    assert read.scene == read.category == spelled, read
-    assert read.value == -1.5
+    first, second = read_lines(folder)
+    assert first.scene == first.metric == second.category == spelled, (first, second)
+    assert (first.value, second.value) == (-1.5, -0.5)
 
 
 def _tables(name: str, folder: Path) -> None:
@@ -158,10 +160,11 @@ def _filled(name: str) -> Filled:
         (Row(name, (), group=name, ours=name, marks={name: True}),),
     )
     cell = Cell(-1.5, 0.5, 2, float("nan"), float("nan"))
-    run = Line("h", "r", "d", name, name, 0, name, 2, name, name, "miou", "", "", 0.5)
+    of = ("h", "r", "d", name, name, 0, name, 2, name, name, name, 1, name)
+    run = Line(*of, "miou", "", "", 0.5)
     cells = {Place(0, name, "miou"): cell}
     said = (f"data: {name}", f"machine: {name}")
-    return Filled(table, BENCHMARK, (name,), {}, {0: "r"}, False, cells, (), tidy([run]), said)
+    return Filled(table, BENCHMARK, (name,), {}, {0: "r"}, False, cells, (), tidy([run]), 2, said)
 
 
 def _obeyed(text: str) -> set[str]:

@@ -170,7 +170,8 @@ def test_two_commits_have_the_same_code_where_they_differ_elsewhere(tmp_path: Pa
 
 
 def test_machine_is_described(tmp_path: Path):
-    assert set(machine()) == {"cpu", "cores", "threads", "torch", "python", "system"}
+    assert set(machine()) == {"cpu", "isa", "cores", "threads", "torch", "python", "system"}
+    assert machine()["isa"] in ("v4", "v3", "base")
     cpuinfo = tmp_path / "cpuinfo"
     cpuinfo.write_text("processor\t: 0\nmodel name\t: Fast CPU @ 2.7GHz\nmodel name\t: other\n")
     assert _cpu_model(cpuinfo) == "Fast CPU @ 2.7GHz"

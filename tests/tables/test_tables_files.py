@@ -14,7 +14,7 @@ from tables_fakes import BENCHMARK, fake_runs, filled_of, value
 from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark
-from vlgs.tables.frame import read_metrics, tidy, to_lines
+from vlgs.tables.frame import read_lines, read_metrics, tidy, to_lines
 from vlgs.tables.html import write_report
 from vlgs.tables.registry import Table, load_table, load_tables
 from vlgs.tables.write import write_all, write_tables
@@ -140,17 +140,16 @@ def test_all_formats_say_where_the_numbers_come_from(table: Table, tmp_path: Pat
             assert words in text, (name, words)
     cells = pd.read_csv(folder / "tiny.csv", comment="#")
     assert len(cells) == 4 * 3 * 2
-    frame = pd.read_csv(tmp_path / "runs.csv")
-    assert len(frame["config_hash"].unique()) == 12
+    assert not (folder / "tiny-claims.csv").exists()  # two seeds
     pytest.importorskip("pyarrow")
-    assert len(pd.read_parquet(tmp_path / "runs.parquet")) == len(frame)
+    assert len(pd.read_parquet(tmp_path / "runs.parquet")) > 12
 
 
 def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
     write_all(tmp_path, [table], html=True)
-    files = [tmp_path / "runs.csv", *sorted((tmp_path / "synthetic").glob("tiny.*"))]
+    files = [tmp_path / "runs.csv", *sorted((tmp_path / "synthetic").glob("tiny*"))]
     before = [file.read_bytes() for file in files]
     assert len(files) == 4
     shutil.rmtree(tmp_path / "runs")
@@ -166,10 +165,110 @@ def test_a_clone_without_the_runs_has_the_same_tables(table: Table, tmp_path: Pa
     files[0].write_bytes(before[0].replace(b",0,dense@1", b",first,dense@1"))
     with pytest.raises(ValueError, match=r"runs.csv: line 2 must be as .*first"):
         write_all(tmp_path, [table])
+    files[0].write_bytes(before[0])
+    categories = tmp_path / "categories.csv"
+    kept = categories.read_bytes()
+    for broken in (b"config_hash,value\na,1\n", kept + b"a,b\n", kept[:-5] + b"nan\n"):
+        categories.write_bytes(broken)
+        with pytest.raises(ValueError, match=r"categories.csv: line \d+ must be as vlgs.tables"):
+            write_all(tmp_path, [table])
+    categories.unlink()
+    with pytest.raises(OSError, match=r"categories\.csv"):
+        write_all(tmp_path, [table])
     files[0].unlink()
     with pytest.raises(ValueError, match="must hold finished runs"):
         write_all(tmp_path, [table])
     assert [file.read_bytes() for file in files[1:]] == before[1:]
+
+
+def test_runs_csv_has_a_row_per_run(table: Table, tmp_path: Path):
+    machine = {"cpu": "a cpu", "isa": "v3", "threads": 2}
+    fake_runs(tmp_path, [table], BENCHMARK, value, more={"machine": machine, "lpips": None})
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    write_all(tmp_path, [table])
+    text = (tmp_path / "runs.csv").read_text()
+    assert "" not in text.splitlines()
+    frame = pd.read_csv(tmp_path / "runs.csv")
+    assert len(frame) == len(frame["config_hash"].unique()) == 12
+    assert "lpips" not in frame  # which no run has
+    assert {*frame["cpu"], *frame["isa"], *frame["threads"]} == {"a cpu", "v3", 2}
+    assert set(frame["overrides"]) == {
+        "data=synthetic", "data=synthetic fusion=none", "data=synthetic indicator=opacity",
+    }  # fmt: skip
+    one = frame[(frame["overrides"] == "data=synthetic") & (frame["scene"] == "mirrors")]
+    assert sorted(one["miou"]) == pytest.approx([0.6, 0.62])
+    assert "one cpu; instruction set: v3; threads: 2" in (
+        tmp_path / "synthetic" / "tiny.tex"
+    ).read_text().replace("a cpu", "one cpu")
+
+    categories = pd.read_csv(tmp_path / "categories.csv")
+    assert len(categories) == 12 * 3  # without the one that no view shows
+    assert set(categories["kind"]) == {"other", "translucent_reflective"}
+    lines = to_lines(read_metrics(tmp_path))
+    known = [line for line in lines if line.value == line.value]
+    read = [line._replace(overrides=None) for line in read_lines(tmp_path)]
+    assert sorted(read) == sorted(known)
+
+
+def test_a_table_of_earlier_code_is_written_and_says_so(
+    table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    write_all(tmp_path, [table])
+    tables = tmp_path / "synthetic"
+    before = (tables / "tiny.csv").read_text()
+    assert "earlier code" not in (tables / "tiny.md").read_text()
+    shutil.rmtree(tmp_path / "runs")
+    # Recipes of another version are others: nothing but the overrides says which row a run is.
+    runs = (tmp_path / "runs.csv").read_text().splitlines()
+    head = runs[0].split(",")
+    older = []
+    for line in runs[1:]:
+        cells = line.split(",")
+        cells[head.index("results_version")] = "1"
+        cells[head.index("recipe")] = f"old{cells[head.index('recipe')]}"
+        older.append(",".join(cells))
+    (tmp_path / "runs.csv").write_text("\n".join([runs[0], *older, ""]))
+    write_all(tmp_path, [table])
+    now = (tables / "tiny.csv").read_text()
+    assert now == before.replace(f"results version {RESULTS_VERSION}", "results version 1")
+    said = f"Runs of results version 1, by earlier code; today's is version {RESULTS_VERSION}."
+    assert said in (tables / "tiny.md").read_text()
+    assert "1 tables are of runs of results version 1" in capsys.readouterr().err
+
+    # One run of today's code: of a table of one version, and not mixed with the rest.
+    fake_runs(tmp_path, [table], replace(BENCHMARK, seeds=(0,)), value)
+    write_all(tmp_path, [table])
+    cells = pd.read_csv(tables / "tiny.csv", comment="#")
+    assert set(cells["seeds"]) == {0, 1}
+
+
+def test_a_table_of_the_papers_scenes_is_another_elsewhere(tmp_path: Path):
+    for name, more in (("view", "elsewhere: own"), ("own", ""), ("twin", "same_runs_as: own")):
+        (tmp_path / f"{name}.yaml").write_text(
+            f"label: {name}\ncaption: words\ndataset: lerf_ovs\nmetrics: [miou]\n{more}\n"
+            "rows: [{label: Without_it, set: [fusion=none]}, {label: Full, set: []}]\n"
+        )
+    view, own, twin = (load_table(tmp_path / f"{n}.yaml") for n in ("view", "own", "twin"))
+    fake_runs(tmp_path, [own], BENCHMARK, value)
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    write_all(tmp_path, [view, twin])
+    names = {path.name for path in (tmp_path / "synthetic").glob("*.md")}
+    assert names == {"own.md", "twin.md"}
+    assert "The same runs as in tab:own" in (tmp_path / "synthetic" / "twin.md").read_text()
+
+
+def test_what_stands_in_a_folder_is_written_again(table: Table, tmp_path: Path):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    BENCHMARK.extend(tmp_path / "synthetic" / "benchmark.yaml")
+    other = replace(table, label="other")
+    write_all(tmp_path, [table])
+    write_all(tmp_path, [table, other], again=True)
+    names = {path.name for path in (tmp_path / "synthetic").glob("*.md")}
+    assert names == {"tiny.md"}
+    write_all(tmp_path, [table, other])
+    assert (tmp_path / "synthetic" / "other.md").is_file()
 
 
 def test_runs_without_a_folder_stay_beside_new_ones(
@@ -186,7 +285,7 @@ def test_runs_without_a_folder_stay_beside_new_ones(
     frame = pd.read_csv(tmp_path / "runs.csv")
     assert set(frame["seed"]) == {0, 1, 2}
     assert len(frame["config_hash"].unique()) == 18
-    assert set(frame["value"][(frame["metric"] == "miou") & (frame["seed"] > 0)]) == {0.9}
+    assert set(frame["miou"][frame["seed"] > 0]) == {0.9}
 
 
 def test_tables_without_torch_on_400_runs(tmp_path: Path):

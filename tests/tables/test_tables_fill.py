@@ -28,6 +28,18 @@ def test_means_and_deviations_are_those_of_the_runs(table: Table, tmp_path: Path
     assert cell(filled, 1, "glassware", "psnr").mean == pytest.approx(30.51)
 
 
+def test_the_papers_average_stands_only_where_an_order_can_be_compared(
+    table: Table, tmp_path: Path
+):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    filled = filled_of(table, tmp_path)
+    assert [cell(filled, row, "avg").paper for row in (0, 1)] == [40.0, 50.0]
+    assert pd.isna(cell(filled, 2, "avg").paper)  # alone in its group: the other row has no run
+    assert pd.isna(cell(filled, 3, "avg").paper)
+    assert pd.isna(cell(filled, 1, "glassware").paper)
+    assert "In brackets: the paper's average, of its own scenes (lerf\\_ovs)." in to_latex(filled)
+
+
 def test_a_missing_run_is_missing(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value, skip=[("Full", "mirrors", s) for s in (0, 1)])
     filled = filled_of(table, tmp_path)
@@ -48,6 +60,7 @@ def test_paper_values_and_differences_on_the_papers_scenes(table: Table, tmp_pat
     assert filled.same_scenes
     assert cell(filled, 1, "avg").difference == pytest.approx(6.0)
     assert "(50.0, +6.0)" in to_latex(filled)
+    assert "In brackets: the paper's value, and ours minus it." in to_latex(filled)
 
 
 BY_CATEGORY = """
@@ -81,9 +94,14 @@ def test_categories_of_several_scenes_by_kind(tmp_path: Path):
         ("translucent_reflective", "mirrors: pot"),
         ("translucent_reflective", "mean of translucent_reflective"),
     ]  # a category that no view shows has no line
-    without, full, gain = lines["mean of translucent_reflective"].entries
+    without, full, less = lines["mean of translucent_reflective"].entries
     assert without.mean == pytest.approx(100 * (0.41 + 0.31 + 0.51 + 0.41) / 4)
-    assert gain.mean == pytest.approx(full.mean - without.mean) == pytest.approx(10.0)
+    assert less.mean == pytest.approx(without.mean - full.mean) == pytest.approx(-10.0)
+    assert arrange(filled).headers == (
+        "Without_it (%)",
+        "Full (%)",
+        "Without_it minus Full (%)",
+    )
     balanced(to_latex(filled))
 
 

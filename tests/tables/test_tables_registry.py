@@ -161,3 +161,12 @@ def test_the_table_of_skips_has_every_switch():
 
     rows = {row.overrides for row in TABLES["skips"].rows}
     assert rows == {()} | {(s.override(on=s.default == "off"),) for s in SKIPS if s.switchable}
+
+
+def test_tables_that_refer_to_others_have_no_row_that_those_lack():
+    """Of the paper's rows: what is run for a view or a twin is run for the other table too."""
+    for table in TABLES.values():
+        other = TABLES.get(table.same_runs_as or table.elsewhere, table)
+        rows = {row.overrides for row in table.rows}
+        assert rows <= {row.overrides for row in other.rows}, table.label
+        assert other.label == (table.same_runs_as or table.elsewhere or table.label)

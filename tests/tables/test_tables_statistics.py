@@ -1,4 +1,4 @@
-"""Intervals and agreement against cases worked by hand, Monte Carlo and scipy."""
+"""Which rows are compared with which, and what may be claimed of them."""
 
 import math
 from collections.abc import Sequence
@@ -7,99 +7,36 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from tables_fakes import fake_runs
 
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.fill import Filled, fill
 from vlgs.tables.frame import read_metrics, tidy, to_lines
+from vlgs.tables.markdown import to_markdown
 from vlgs.tables.registry import Row, load_table
-from vlgs.tables.statistics import (
-    bootstrap_interval,
-    judge,
-    kendall_tau,
-    order_agreement,
-    paired_differences,
-    sentence,
-)
+from vlgs.tables.said import claims_csv, say
+from vlgs.tables.statistics import Claim, claims, judge, orders
 
 
 def scipys_tau(ours: Sequence[float], papers: Sequence[float]) -> float:
     return float(np.asarray(stats.kendalltau(ours, papers))[0])
 
 
-def test_an_interval_worked_by_hand():
-    """Two scenes with one seed each: a resample is their mean or one of them, with chances 1/2, 1/4, 1/4."""
-    assert bootstrap_interval([np.array([1.0]), np.array([3.0])], seed=0) == (1.0, 3.0)
-
-
-def test_one_scene_is_the_bootstrap_over_its_seeds():
-    """Five seeds of 0, 0, 0, 0, 1: the mean of a resample is binomial(5, 1/5) / 5, whose quantiles are known."""
-    low, high = bootstrap_interval([np.array([0.0, 0.0, 0.0, 0.0, 1.0])], seed=0)
-    want = stats.binom(5, 0.2).ppf([0.025, 0.975]) / 5
-    assert (low, high) == pytest.approx(tuple(want))
-
-
-def test_equal_numbers_have_no_width():
-    part = np.array([0.7, 0.7, 0.7])
-    assert bootstrap_interval([part, part], seed=3) == pytest.approx((0.7, 0.7))
-
-
-def test_scenes_of_unequal_size_against_a_plain_loop():
-    rng = np.random.default_rng(5)
-    scenes = [rng.normal(0, 1, 3), rng.normal(2, 1, 5), rng.normal(-1, 2, 4), rng.normal(1, 1, 1)]
-    means = []
-    for _ in range(20_000):
-        drawn = [scenes[i] for i in rng.integers(len(scenes), size=len(scenes))]
-        means.append(np.mean([rng.choice(part, size=len(part)).mean() for part in drawn]))
-    got = bootstrap_interval(scenes, seed=0)
-    # Both are Monte Carlo: quantiles of 10 000 and 20 000 draws of width 1 differ by about 0.03 (3 sigma measured over seeds: 0.07).
-    assert got == pytest.approx(tuple(np.quantile(means, [0.025, 0.975])), abs=0.1)
-
-
-def test_many_scenes_cover_the_truth_as_often_as_promised():
-    """Normal scene effects and seeds around a known mean; the percentile interval of 12 scenes covers a little less than 95%."""
-    rng = np.random.default_rng(1)
-    covered = 0
-    for trial in range(150):
-        effects = rng.normal(0.5, 1.0, 12)
-        low, high = bootstrap_interval([rng.normal(e, 0.3, 3) for e in effects], seed=trial)
-        covered += low <= 0.5 <= high
-    # Binomial(150, 0.92): 3 sigma is 10 below 138; all of them would mean an interval that is too wide.
-    assert 125 <= covered < 150
-
-
-def test_one_number_says_nothing():
-    assert bootstrap_interval([np.array([5.0])], seed=0) == (-math.inf, math.inf)
-
-
-@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=2, max_size=9))
-def test_kendall_is_scipys(pairs: list[tuple[int, int]]):
-    ours, papers = [float(a) for a, _ in pairs], [float(b) for _, b in pairs]
-    want = scipys_tau(ours, papers)
-    assert kendall_tau(ours, papers) == pytest.approx(want, nan_ok=True)
-
-
-def test_kendall_needs_two():
-    assert math.isnan(kendall_tau([1.0], [2.0]))
-    assert math.isnan(kendall_tau([], []))
-
-
 @pytest.mark.parametrize(
-    ("low", "high", "paper", "verdict"),
+    ("p", "mean", "within", "paper", "verdict"),
     [
-        (-3.0, -1.0, -2.0, "holds"),
-        (1.0, 3.0, -2.0, "reversed"),
-        (-1.0, 1.0, -2.0, "undecided"),
-        (-math.inf, math.inf, -2.0, "undecided"),
-        (-3.0, -1.0, math.nan, "no claim"),
-        (-3.0, -1.0, 0.0, "no claim"),
+        (0.01, -3.0, False, -2.0, "holds"),
+        (0.01, 3.0, False, -2.0, "reversed"),
+        (0.01, 0.5, True, -2.0, "reversed"),
+        (0.06, 3.0, False, -2.0, "cannot be told"),
+        (0.06, 0.1, True, -2.0, "equivalent"),
+        (0.01, -3.0, False, math.nan, "below"),
+        (0.01, 3.0, False, 0.0, "above"),
     ],
 )
-def test_verdicts(low: float, high: float, paper: float, verdict: str):
-    assert judge(low, high, paper) == verdict
+def test_verdicts(p: float, mean: float, within: bool, paper: float, verdict: str):
+    assert judge(p, mean, within, paper) == verdict
 
 
 TABLE = """
@@ -113,6 +50,7 @@ rows:
   - {label: Full, set: [], paper: {avg: 50.0}}
   - {label: Better, set: [indicator=opacity], paper: {avg: 45.0}}
   - {label: Same, set: [fusion=mlp], paper: {avg: 48.0}}
+  - {label: Alike, set: [blend=none], paper: {avg: 47.0}}
   - {label: Ours, set: [fusion=cross]}
   - {label: Full again, set: [], paper: {avg: 50.0}}
 """
@@ -122,7 +60,8 @@ BENCHMARK = Benchmark("synthetic", ("data=synthetic",), ("glassware", "mirrors")
 def value(row: Row, scene: str, seed: int) -> float:
     """Scenes and seeds differ widely, so that only pairs show a difference."""
     offset = {"Worse": -0.05, "Better": 0.04, "Same": 0.03 * (-1) ** seed, "Ours": 0.02}
-    offset |= {"Clean full": 0.1}
+    offset |= {"Clean full": 0.1, "Alike": 0.001 * (-1) ** seed}
+    offset |= {"Four seeds": 0.01, "bare": 0.03, "a alone": 0.01, "b alone": 0.02}
     return 0.5 + (0.2 if scene == "mirrors" else 0.0) + 0.05 * seed + offset.get(row.label, 0.0)
 
 
@@ -139,36 +78,135 @@ def filled_of(
     return fill(table, benchmark, Composer(benchmark), tidy(to_lines(read_metrics(tmp_path))))
 
 
+def by_label(filled: Filled) -> dict[str, Claim]:
+    return {claim.label: claim for claim in claims(filled)}
+
+
 def test_rows_are_judged_in_pairs(tmp_path: Path):
     filled = filled_of(tmp_path)
-    found = {d.label: d for d in paired_differences(filled, "miou")}
+    found = by_label(filled)
     assert {name: d.verdict for name, d in found.items()} == {
-        "Worse": "holds", "Better": "reversed", "Same": "undecided", "Ours": "no claim",
+        "Worse": "holds", "Better": "reversed", "Same": "cannot be told", "Alike": "equivalent", "Ours": "above",
     }  # fmt: skip
-    assert found["Worse"].mean == pytest.approx(-5.0)
-    assert (found["Worse"].low, found["Worse"].high) == pytest.approx((-5.0, -5.0))
-    assert found["Worse"].pairs == 6
-    assert found["Worse"].paper == pytest.approx(-10.0)
-    text = sentence(filled, "miou")
-    assert "The paper's sign holds for Worse -5.0 [-5.0, -5.0] (paper -10.0)." in text
-    assert "It is reversed for Better +4.0" in text
-    assert "The data cannot tell for Same +1.0" in text
-    assert "The paper gives no number for Ours +2.0" in text
-    # Ours: Worse < Full < Same < Better; the paper: Worse < Better < Same < Full. rows of the full model count once.
-    want = scipys_tau([55, 60, 64, 61], [40, 50, 45, 48])
-    assert order_agreement(filled, "miou") == pytest.approx(want)
-    assert f"{want:+.2f}" in text
+    worse = found["Worse"]
+    assert worse.mean == pytest.approx(-5.0)
+    assert worse.here
+    assert (worse.here.low, worse.here.high) == pytest.approx((-5.0, -5.0))
+    assert (worse.scenes, worse.agree, worse.seeds) == (2, 2, 3)
+    assert worse.paper == pytest.approx(-10.0)
+    assert worse.beyond is None  # two scenes are no sample of scenes
+    # Seeds lie 5 points apart and Better 4 points above: it beats the same seed and those below, on each scene.
+    assert found["Better"].better == pytest.approx(6 / 9)
+    same = [3.0, -3.0, 3.0]  # on both scenes, hence the same mean with half of the variance
+    assert found["Same"].here
+    error = np.std(same, ddof=1) / 3**0.5 / 2**0.5
+    want = stats.t.interval(0.95, 4, 1.0, error)
+    assert (found["Same"].here.low, found["Same"].here.high) == pytest.approx(want)
+    # Holm: the largest of five p-values stays.
+    assert max(c.here.p for c in found.values() if c.here) == pytest.approx(found["Alike"].here.p)  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_what_is_said_is_in_all_formats(tmp_path: Path):
+    filled = filled_of(tmp_path)
+    said = say(filled)
+    lines = {line[0]: line for line in said.lines}
+    assert lines["Worse"][1:4] == ("mIoU (%)", "-5.00", "-5.00 to -5.00")
+    assert lines["Worse"][-1] == "holds"
+    assert "over all 5 differences" in said.before
+    # Ours: Worse < Full < Alike < Same < Better; the paper: Worse < Better < Alike < Same < Full. Rows of the full model count once.
+    want = scipys_tau([55, 60, 64, 61, 60.033], [40, 50, 45, 48, 47])
+    (order,) = orders(filled)
+    assert order.tau == pytest.approx(want)
+    assert order.rows == 5
+    assert f"{want:+.2f} (5 rows)" in said.after
+    text = to_markdown(filled)
+    assert "-5.00 to -5.00" in text
+    assert f"{want:+.2f} (5 rows)" in text
+    assert ",Worse,miou,-5.0000,-5.0000,-5.0000," in (claims_csv(filled) or "")
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_claim_on_few_seeds_is_refused(tmp_path: Path, seeds: int):
+    few = replace(BENCHMARK, seeds=tuple(range(seeds)))
+    filled = filled_of(tmp_path, few)
+    assert {claim.verdict for claim in claims(filled)} == {"no claim"}
+    said = say(filled)
+    assert said.lines == ()
+    assert said.before.startswith(f"No claim is made: rows have {seeds} seed")
+    assert claims_csv(filled) is None
+
+
+def test_a_table_of_one_seed_is_made_of_that_seed(tmp_path: Path):
+    filled = filled_of(tmp_path, text=TABLE.replace("metrics:", "seeds: [1]\nmetrics:"))
+    assert {cell.seeds for cell in filled.cells.values()} == {1}
+    assert "One seed, hence no deviation and no claim." in to_markdown(filled)
+    assert "**" not in to_markdown(filled)
+    assert {claim.verdict for claim in claims(filled)} == {"no claim"}
+
+
+def test_five_scenes_speak_of_scenes_like_these(tmp_path: Path):
+    names = ("glassware", "mirrors", "lookalikes", "patchwork", "another")
+    filled = filled_of(tmp_path, replace(BENCHMARK, scenes=names))
+    shift: dict[str, float] = dict(zip(names, (0.0, 3.0, -3.0, 6.0, -6.0), strict=True))
+    numbers = [
+        n._replace(value=n.value + shift.get(n.column, 0.0) * (filled.table.rows[n.row].label == "Better"))
+        for n in filled.numbers
+    ]  # fmt: skip
+    better = by_label(replace(filled, numbers=numbers))["Better"]
+    assert better.here
+    assert better.beyond
+    want = stats.t.interval(0.95, 4, 4.0, np.std(list(shift.values()), ddof=1) / 5**0.5)
+    assert (better.beyond.low, better.beyond.high) == pytest.approx(want)
+    assert (better.here.verdict, better.beyond.verdict) == ("reversed", "cannot be told")
+    assert (better.agree, better.scenes) == (4, 5)
+    said = say(replace(filled, numbers=numbers))
+    (line,) = (line for line in said.lines if line[0] == "Better")
+    assert line[-1] == "reversed; on scenes like these cannot be told"
+
+
+SWITCHES = """
+label: tiny
+caption: words
+dataset: lerf_ovs
+scenes: {ramen: ramen}
+metrics: [miou, train_minutes]
+rows:
+  - {label: bare, marks: {a: false, b: false}, set: [fusion=none, blend=none], paper: {avg: 40.0}}
+  - {label: a alone, marks: {a: true, b: false}, set: [blend=none], paper: {avg: 44.0}}
+  - {label: b alone, marks: {a: false, b: true}, set: [fusion=none], paper: {avg: 42.0}}
+  - {label: both, marks: {a: true, b: true}, set: [], paper: {avg: 50.0}}
+"""
+
+
+def test_effects_of_switches_worked_by_hand(tmp_path: Path):
+    """Rows are 3, 1, 2 and 0 points above the full model, whatever the seed; times make no claim."""
+    filled = filled_of(tmp_path, text=SWITCHES)
+    assert {claim.metric for claim in claims(filled)} == {"miou"}
+    found = {c.label: c for c in claims(filled) if c.effect}
+    assert {name: round(c.mean, 6) for name, c in found.items()} == {"a": -2.0, "b": -1.0, "a x b": 0.0}  # fmt: skip
+    assert {name: c.paper for name, c in found.items()} == {"a": 6.0, "b": 4.0, "a x b": 2.0}
+    assert found["a"].verdict == found["b"].verdict == "reversed"
+    assert len(claims(filled)) == 6  # three rows against the full one, and three effects
+    without_one = filled_of(tmp_path, text=SWITCHES.replace("  - {label: b alone", "  # - {"))
+    assert not any(claim.effect for claim in claims(without_one))
+
+
+def test_orders_are_compared_within_groups(tmp_path: Path):
+    text = TABLE.replace("label: Worse,", "label: Worse, group: B,").replace(
+        "label: Same,", "label: Same, group: B,"
+    )
+    found = {order.group: order for order in orders(filled_of(tmp_path, text=text))}
+    assert found["B"].tau == 1.0
+    assert found["B"].rows == 2
+    assert found[""].tau == pytest.approx(scipys_tau([60, 64, 60.033], [50, 45, 47]))
 
 
 def test_the_order_in_which_runs_are_read_moves_no_interval(tmp_path: Path):
     rng = np.random.default_rng(0)
     filled = filled_of(tmp_path)
     spread = [n._replace(value=n.value + rng.normal()) for n in filled.numbers]
-    one, other = (
-        paired_differences(replace(filled, numbers=numbers), "miou")
-        for numbers in (spread, spread[::-1])
-    )
-    assert [(d.low, d.high) for d in other] == [(d.low, d.high) for d in one]
+    one, other = (claims(replace(filled, numbers=n)) for n in (spread, spread[::-1]))
+    assert [claim.here for claim in other] == [claim.here for claim in one]
 
 
 def test_a_group_on_other_data_is_compared_with_its_own_full_model(tmp_path: Path):
@@ -178,7 +216,7 @@ def test_a_group_on_other_data_is_compared_with_its_own_full_model(tmp_path: Pat
   - {{label: Clean full, group: Clean, set: [{other}]}}
 """
     filled = filled_of(tmp_path, text=TABLE + more.lstrip("\n"))
-    differences = paired_differences(filled, "miou")
+    differences = claims(filled)
     assert [(d.group, d.mean) for d in differences if d.label == "Worse"] == [
         ("", pytest.approx(-5.0)),
         ("Clean", pytest.approx(-15.0)),
@@ -194,8 +232,8 @@ def test_pairs_without_a_partner_are_left_out(tmp_path: Path):
         ("Worse", "glassware", 1),
     ]
     filled = filled_of(tmp_path, skip=skip)
-    worse = next(d for d in paired_differences(filled, "miou") if d.label == "Worse")
-    assert worse.pairs == 2
+    worse = by_label(filled)["Worse"]
+    assert (worse.scenes, worse.seeds, worse.verdict) == (1, 2, "no claim")
     assert worse.mean == pytest.approx(-5.0)  # and not the difference of unequal scenes
 
 
@@ -207,11 +245,5 @@ def test_without_the_full_model_nothing_is_said(tmp_path: Path):
         for seed in (0, 1, 2)
     ]
     filled = filled_of(tmp_path, skip=skip)
-    assert paired_differences(filled, "miou") == []
-    assert sentence(filled, "miou").startswith("No row can be compared")
-
-
-def test_one_run_of_each_has_a_difference_but_no_verdict(tmp_path: Path):
-    filled = filled_of(tmp_path, Benchmark("synthetic", ("data=synthetic",), ("glassware",), (0,)))
-    assert {d.verdict for d in paired_differences(filled, "miou")} == {"undecided", "no claim"}
-    assert "Worse -5.0 [one pair, no interval] (paper -10.0)" in sentence(filled, "miou")
+    assert claims(filled) == []
+    assert say(filled).before.startswith("No row can be compared")

@@ -45,6 +45,8 @@ def plan(
     wanted: dict[tuple[RunIdentity, str], tuple[tuple[str, ...], list[str]]] = {}
     for seed in benchmark.seeds:
         for table in tables:
+            if seed not in table.chosen(benchmark.seeds):
+                continue
             for row in table.rows:
                 assert row.overrides is not None
                 title = f"{table.label}: {row.label}"

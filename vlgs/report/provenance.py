@@ -7,13 +7,16 @@ from pathlib import Path
 
 import torch
 
+from vlgs.ops.machine import instruction_set
+
 PACKAGE = Path(__file__).parents[1]
 
 
 def machine() -> dict[str, str | int]:
-    """CPU model, logical cores this process may use, threads of torch, versions."""
+    """CPU model, instruction set of the kernels, logical cores this process may use, threads of torch, versions."""
     return {
         "cpu": _cpu_model(),
+        "isa": instruction_set(),
         "cores": len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count() or 1,

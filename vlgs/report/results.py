@@ -88,7 +88,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "fingerprint": ("", "hash of the data's content"),
     "results_version": ("", "raised by changes of vlgs that can move a number"),
     "commit": ("", "git commit, +dirty with local changes, null for an installed wheel"),
-    "machine": ("", "cpu, cores, threads, torch, platform"),
+    "machine": ("", "cpu, isa (instruction set of the kernels), cores, threads, torch, platform"),
     "per_view": ("", "held-out view -> psnr, ssim"),
     "failure": ("", "why nothing could be scored although it was asked for; null for a good run"),
     "reasons": (

@@ -1,15 +1,16 @@
 """Write the tables of every benchmark below `results` from the runs that are there.
 
-    python -m vlgs.tables                  all tables of all benchmarks (folders with a benchmark.yaml)
-    python -m vlgs.tables tab=ab-multi     one table; several: tab=ab-multi,ab-cam
+    python -m vlgs.tables                  the tables that stand in each benchmark's folder (with a benchmark.yaml), again
+    python -m vlgs.tables tab=ab-multi     one table; several: tab=ab-multi,ab-cam; all that have runs: tab=all
     python -m vlgs.tables results=FOLDER   other than ./results
     python -m vlgs.tables html=true        index.html with plots too
     python -m vlgs.tables FOLDER           one line for each run of any folder of runs: what differs, scores, where it lies
     python -m vlgs.tables FOLDER write=F   the same to a file F.csv or F.md
 
-Writes results/runs.csv (one row per run, metric and category; runs.parquet with pyarrow), and per benchmark <label>.csv, .md and
-.tex, and tables.tex over all of them. Nothing is trained, and nothing that has no run is filled in. Runs that stand in runs.csv and have
-no folder here, as in a fresh clone, stay; delete the file to leave them out.
+Writes results/runs.csv (one row per run) and categories.csv (one per run and category; both in runs.parquet with pyarrow), and per
+benchmark <label>.csv, .md and .tex, <label>-claims.csv with every difference, interval and verdict, and tables.tex over all of them.
+Nothing is trained, and nothing that has no run is filled in. Runs that stand in runs.csv and have no folder here, as in a fresh clone, stay;
+delete the file to leave them out. A table of runs of earlier code is written from them and says so.
 """
 
 import gc
@@ -44,7 +45,7 @@ def main() -> None:
             raise ValueError(f"tables: html must be true or false, got {given['html']}")
         tables = choose(given.get("tab", "all").split(","), load_tables())
         results, html = Path(given.get("results", "results")), given.get("html") == "true"
-        for path in write_all(results, tables, html=html):
+        for path in write_all(results, tables, html=html, again="tab" not in given):
             print(path)
     except (ValueError, OSError) as error:
         sys.exit(screen(f"error: {error}"))

@@ -3,11 +3,12 @@
 import hashlib
 import json
 import logging
+import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -119,6 +120,36 @@ class Benchmark:
             )
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+@runtime_checkable
+class Recipes(Protocol):
+    """Knows which run a row of a benchmark is."""
+
+    def identity(self, overrides: Sequence[str], seed: int) -> RunIdentity:
+        """Recipe of a row."""
+        ...
+
+
+class Recorded:
+    """Recipes of runs of an earlier results version, by the overrides that runs.csv keeps of them. A row without such a run has no recipe.
+
+    Args:
+        benchmark: Data, scenes and seeds.
+        runs: Recipe, data recipe and overrides of each run.
+    """
+
+    def __init__(self, benchmark: Benchmark, runs: Iterable[tuple[str, str, str | None]]) -> None:
+        first = benchmark.recorded
+        self._rows: dict[frozenset[str], tuple[str, str]] = {}
+        for recipe, data, overrides in set(runs):
+            words = tuple(shlex.split(overrides or ""))
+            if overrides and words[: len(first)] == first:
+                self._rows[frozenset(words[len(first) :])] = recipe, data
+
+    def identity(self, overrides: Sequence[str], seed: int) -> RunIdentity:
+        """Recipe of a row, empty where none is known."""
+        return RunIdentity(*self._rows.get(frozenset(overrides), ("", "")), seed)
 
 
 class Composer:

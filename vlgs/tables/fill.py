@@ -2,14 +2,14 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import pandas as pd
 
 from vlgs.config import split_override
-from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
+from vlgs.tables.benchmark import Benchmark, Recipes, UnknownOptionError
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE, Table
 
@@ -60,7 +60,7 @@ class Filled:
     kinds: Mapping[str, str]
     """Category column -> kind; empty for a table by scene."""
     recipes: Mapping[int, str]
-    """Row -> recipe of its runs."""
+    """Row -> recipe of its runs; without rows of which none is known."""
     same_scenes: bool
     """Whether the scenes are the paper's, so that its values can be set against ours."""
     cells: Mapping[Place, Cell]
@@ -69,26 +69,28 @@ class Filled:
     """Every single number behind the cells."""
     runs: pd.DataFrame
     """One line of each run behind the cells, as `vlgs.tables.frame.tidy` has it."""
+    results_version: int
+    """Of those runs; 0 without any."""
     provenance: tuple[str, ...]
     """Machine, commit, protocol, seeds and data of those runs, as text."""
 
 
-def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataFrame) -> Filled:
+def fill(table: Table, benchmark: Benchmark, recipes: Recipes, frame: pd.DataFrame) -> Filled:
     """Look up the runs of every row.
 
     Args:
         table: What to fill.
         benchmark: Data, scenes and seeds.
-        composer: Of the same benchmark.
+        recipes: Of the same benchmark.
         frame: Of all runs, as `vlgs.tables.frame.tidy` has it.
 
     Raises:
         UnknownOptionError: If a row names an option that does not exist; the file and the row are named.
     """
-    rows = _rows(table, benchmark, composer)
+    rows = _rows(table, benchmark, recipes)
     scenes, several = benchmark.scenes, len(set(benchmark.scenes)) > 1
     mine = frame[frame["recipe"].isin(rows["recipe"])]
-    mine = mine[mine["scene"].isin(scenes) & mine["seed"].isin(benchmark.seeds)]
+    mine = mine[mine["scene"].isin(scenes) & mine["seed"].isin(table.chosen(benchmark.seeds))]
     found = rows.merge(mine, on=["recipe", "data_recipe"]).merge(_entries(table), on="metric")
     numbers = found.assign(value=found["value"] * found["factor"], metric=found["name"])
     if table.by_category:
@@ -107,12 +109,15 @@ def fill(table: Table, benchmark: Benchmark, composer: Composer, frame: pd.DataF
         benchmark=benchmark,
         columns=tuple(columns),
         kinds={column: kind for column, kind in columns.items() if kind},
-        recipes=dict(zip(rows["row"], rows["recipe"], strict=True)),
+        recipes={
+            row: recipe for row, recipe in zip(rows["row"], rows["recipe"], strict=True) if recipe
+        },
         same_scenes=same,
         cells=dict(_cells(table, tuple(columns), numbers, same)),
         numbers=[Number(*each) for each in numbers[list(Number._fields)].itertuples(index=False)],
         runs=runs,
-        provenance=_provenance(benchmark, runs),
+        results_version=int(runs["results_version"].max()) if len(runs) else 0,
+        provenance=_provenance(table, benchmark, runs),
     )
 
 
@@ -126,12 +131,12 @@ def printed_name(category: str) -> str:
     return category.replace(" ", "_")
 
 
-def _rows(table: Table, benchmark: Benchmark, composer: Composer) -> pd.DataFrame:
+def _rows(table: Table, benchmark: Benchmark, recipes: Recipes) -> pd.DataFrame:
     """Number, recipe and data recipe of every row."""
     rows = []
     for index, row in enumerate(table.rows):
         try:
-            wanted = composer.identity(row.overrides, benchmark.seeds[0])
+            wanted = recipes.identity(row.overrides, benchmark.seeds[0])
         except UnknownOptionError as error:
             where = f"{table.source}: rows[{index}].set"
             raise UnknownOptionError(
@@ -192,24 +197,38 @@ def _cells(
     names = {scene: paper for paper, scene in table.scenes.items()} | {AVERAGE: AVERAGE}
     groups = numbers.groupby(list(Place._fields))["value"].agg(["mean", "std", "count"])
     spread = dict(zip(groups.index, groups.itertuples(index=False, name=None), strict=True))
+    ordered = set() if same else _ordered(table, set(spread))
     for place in itertools.starmap(
         Place, itertools.product(range(len(table.rows)), columns, table.metrics)
     ):
         mean, std, seeds = spread.get(place, (math.nan, math.nan, 0))
-        paper, column = table.rows[place.row].paper, place.column
+        row, column = table.rows[place.row], place.column
         printed = printed_name(column) if table.by_category else names.get(column, "")
-        known = same or column == AVERAGE
-        theirs = paper.get(printed, {}).get(place.metric, math.nan) if known else math.nan
+        known = same or (column == AVERAGE and (row.group, place.metric) in ordered)
+        theirs = row.paper.get(printed, {}).get(place.metric, math.nan) if known else math.nan
         yield place, Cell(mean, std, seeds, theirs, mean - theirs if same else math.nan)
 
 
-def _provenance(benchmark: Benchmark, runs: pd.DataFrame) -> tuple[str, ...]:
+def _ordered(table: Table, filled: Collection[tuple[int, str, str]]) -> set[tuple[str, str]]:
+    """Groups and metrics of which two different rows have an average of ours and of the paper, so that their order can be compared."""
+    rows: dict[tuple[str, str], set[tuple[str, ...]]] = {}
+    for (index, row), metric in itertools.product(enumerate(table.rows), table.metrics):
+        if metric in row.paper.get(AVERAGE, {}) and (index, AVERAGE, metric) in filled:
+            rows.setdefault((row.group, metric), set()).add(row.overrides)
+    return {place for place, different in rows.items() if len(different) > 1}
+
+
+def _provenance(table: Table, benchmark: Benchmark, runs: pd.DataFrame) -> tuple[str, ...]:
     def all_of(column: str) -> str:
-        return ", ".join(sorted(map(str, runs[column].dropna().unique()))) or "--"
+        values = runs[column].dropna().unique()
+        return (
+            ", ".join(sorted(str(int(v)) if isinstance(v, float) else str(v) for v in values))
+            or "--"
+        )
 
     return (
         f"data: {' '.join(benchmark.overrides)}; scenes {', '.join(benchmark.scenes)}; "
-        f"seeds {', '.join(map(str, benchmark.seeds))}",
+        f"seeds {', '.join(map(str, table.chosen(benchmark.seeds)))}",
         f"runs: {len(runs)}; protocol {all_of('protocol')}; results version {all_of('results_version')}",
-        f"commit: {all_of('commit')}; machine: {all_of('cpu')}",
+        f"commit: {all_of('commit')}; machine: {all_of('cpu')}; instruction set: {all_of('isa')}; threads: {all_of('threads')}",
     )

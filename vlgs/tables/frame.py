@@ -1,10 +1,10 @@
-"""Finished runs as one tidy frame: a line per run, metric and category."""
+"""Finished runs as one tidy frame, a line per run, metric and category; on disk one row per run, and a file of categories beside it."""
 
 import csv
 import io
 import logging
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,13 +12,13 @@ import pandas as pd
 
 from vlgs.files import write_atomically, write_changed
 from vlgs.finished import read_finished
-from vlgs.text import csv_cell, csv_line, csv_text, screen, to_bytes
+from vlgs.text import csv_line, csv_text, screen, to_bytes
 
 log = logging.getLogger(__name__)
 
 
 class Line(NamedTuple):
-    """One number of a run; all but the last four are the same in all lines of a run, as in metrics.json."""
+    """One number of a run; all but the last four are the same in all lines of a run."""
 
     config_hash: str
     recipe: str
@@ -30,6 +30,11 @@ class Line(NamedTuple):
     results_version: int
     commit: str | None
     cpu: str | None
+    isa: str | None
+    """Instruction set that the kernels used: another CPU or another set acts like another seed."""
+    threads: int | None
+    overrides: str | None
+    """Command line of the row that the run fills: of its benchmark and its own, without scene and seed. None for runs of no row."""
     metric: str
     category: str
     """Of the metric ``per_category``, "" otherwise, as is `kind`."""
@@ -38,9 +43,15 @@ class Line(NamedTuple):
     """NaN where it could not be computed."""
 
 
-RUN_COLUMNS = Line._fields[: Line._fields.index("cpu")]
+RUN_COLUMNS = Line._fields[: Line._fields.index("metric")]
+"""What is the same in all lines of a run."""
+_FLAT = RUN_COLUMNS[: RUN_COLUMNS.index("cpu")]
+"""Of these, what stands in metrics.json as it is."""
+_OPTIONAL = ("protocol", "commit", "cpu", "isa", "overrides")
+CATEGORY_COLUMNS = ("config_hash", "category", "kind", "value")
+PER_CATEGORY = "per_category"
 
-DETAILS = {"per_category", "category_kinds", "indicator", "per_view", "reasons", "machine", "skips"}
+DETAILS = {PER_CATEGORY, "category_kinds", "indicator", "per_view", "reasons", "machine", "skips"}
 """Entries of metrics.json that are not one value."""
 MOST_PLACES = 6
 """Runs that an error lists."""
@@ -67,33 +78,61 @@ def to_lines(runs: Iterable[Mapping[str, Any]]) -> list[Line]:
     for run in runs:
         if "recipe" not in run:
             continue
-        shared: dict[str, Any] = {name: run.get(name) for name in RUN_COLUMNS}
-        shared |= {"scene": str(run.get("scene")), "cpu": (run.get("machine") or {}).get("cpu")}
-        first = tuple(shared.values())
+        machine = run.get("machine") or {}
+        shared: dict[str, Any] = {name: run.get(name) for name in _FLAT}
+        shared |= {"scene": str(run.get("scene"))}
+        shared |= {name: machine.get(name) for name in ("cpu", "isa", "threads")}
+        first = (*shared.values(), None)
         for metric, value in run.items():
-            if metric in RUN_COLUMNS or metric in DETAILS or isinstance(value, (str, dict, list)):
+            if metric in Line._fields or metric in DETAILS or isinstance(value, (str, dict, list)):
                 continue
             lines.append(Line._make((*first, metric, "", "", _number(value))))
         kinds = run.get("category_kinds") or {}
         for category, value in (run.get("per_category") or {}).items():
             kind = kinds.get(category, "")
-            lines.append(Line._make((*first, "per_category", category, kind, _number(value))))
+            lines.append(Line._make((*first, PER_CATEGORY, category, kind, _number(value))))
     return lines
 
 
-def read_lines(results: Path, without: Collection[str] = ()) -> list[Line]:
-    """The inverse of `write_frame`: runs.csv; empty if it is not there.
-
-    Args:
-        results: Folder that it lies in.
-        without: Runs (`Line.config_hash`) that are not wanted.
+def read_lines(results: Path) -> list[Line]:
+    """The inverse of `write_lines`: runs.csv and categories.csv; empty if runs.csv is not there.
 
     Raises:
-        ValueError: If the file is not such a frame; it is named.
+        ValueError: If a file is not as it was written; it is named.
     """
-    path = results / "runs.csv"
-    if not path.is_file():
+    if not (results / "runs.csv").is_file():
         return []
+    runs: dict[str, tuple[Any, ...]] = {}
+    lines: list[Line] = []
+    rows = _rows(results / "runs.csv")
+    metrics = _head(results / "runs.csv", rows, RUN_COLUMNS)
+    for number, cells in rows:
+        try:
+            shared = _shared(cells[: len(RUN_COLUMNS)])
+            values = cells[len(RUN_COLUMNS) :]
+            for metric, value in zip(metrics, values, strict=True):
+                if value:
+                    lines.append(Line._make((*shared, metric, "", "", _finite(value))))
+        except (IndexError, ValueError) as error:
+            raise ValueError(_damaged(results / "runs.csv", number, error)) from error
+        runs[shared[0]] = shared
+    path = results / "categories.csv"
+    rows = _rows(path)
+    _head(path, rows, CATEGORY_COLUMNS, exactly=True)
+    for number, cells in rows:
+        try:
+            name, category, kind, value = cells
+            if name in runs:
+                lines.append(
+                    Line._make((*runs[name], PER_CATEGORY, category, kind, _finite(value)))
+                )
+        except ValueError as error:
+            raise ValueError(_damaged(path, number, error)) from error
+    return lines
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers and cells of a CSV file."""
     content = path.read_bytes()
     try:
         text = content.decode()
@@ -103,21 +142,45 @@ def read_lines(results: Path, without: Collection[str] = ()) -> list[Line]:
     rows = csv.reader(io.StringIO(text, newline=""), strict=True)
     marked = "'" in text  # else no text was marked as one, which is quickly seen
     try:
-        head = next(rows, [])
-        if tuple(head) != Line._fields:
-            raise ValueError(f"columns {', '.join(head) or 'none'}")
-        if marked:
-            return [_line(*map(csv_text, row)) for row in rows if csv_text(row[0]) not in without]
-        return [_line(*row) for row in rows if row[0] not in without]
-    except (IndexError, TypeError, ValueError, csv.Error) as error:
-        said = "too few or too many cells" if isinstance(error, (IndexError, TypeError)) else error
-        raise ValueError(_damaged(path, rows.line_num, said)) from error
+        for row in rows:
+            yield rows.line_num, list(map(csv_text, row)) if marked else row
+    except csv.Error as error:
+        raise ValueError(_damaged(path, rows.line_num, error)) from error
+
+
+def _head(
+    path: Path,
+    rows: Iterator[tuple[int, list[str]]],
+    wanted: Sequence[str],
+    exactly: bool = False,
+) -> list[str]:
+    """The columns after those that are wanted."""
+    _, head = next(rows, (1, []))
+    if tuple(head[: len(wanted)]) != tuple(wanted) or (exactly and len(head) > len(wanted)):
+        raise ValueError(_damaged(path, 1, f"columns {', '.join(head) or 'none'}"))
+    return head[len(wanted) :]
+
+
+def _shared(cells: Sequence[str]) -> tuple[Any, ...]:
+    """What is the same in all lines of a run."""
+    known: dict[str, Any] = dict(zip(RUN_COLUMNS, cells, strict=True))
+    known |= {name: known[name] or None for name in _OPTIONAL}
+    known |= {name: int(known[name]) for name in ("seed", "results_version")}
+    known["threads"] = int(known["threads"]) if known["threads"] else None
+    return tuple(known.values())
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"value {text}")
+    return value
 
 
 def _damaged(path: Path, line: int, got: object) -> str:
     return screen(
-        f"{path}: line {line} must be as vlgs.tables writes it, got {got!s:.200}; take the file from version control, or delete it "
-        "to leave out runs that have no folder here"
+        f"{path}: line {line} must be as vlgs.tables writes it, got {got!s:.200}; take the file from version control, or delete "
+        "runs.csv to leave out runs that have no folder here"
     )
 
 
@@ -130,32 +193,22 @@ def add_kept(found: Sequence[Line], results: Path) -> list[Line]:
         ValueError: As `read_lines`.
     """
     taken = {_place(line) for line in found}
-    others = read_lines(results, without={line.config_hash for line in found})
-    kept = [line for line in others if _place(line) not in taken]
+    known = read_lines(results)
+    overrides = {line.config_hash: line.overrides for line in known}
+    named = [line._replace(overrides=overrides.get(line.config_hash)) for line in found]
+    here = {line.config_hash for line in found}
+    kept = [line for line in known if line.config_hash not in here and _place(line) not in taken]
     if found and kept:
         log.warning(
             "%s: %d runs that have no folder here are kept; delete the file to leave them out",
             results / "runs.csv",
             len({line.config_hash for line in kept}),
         )
-    return sorted([*found, *kept], key=lambda line: line.config_hash)
+    return sorted([*named, *kept], key=lambda line: line.config_hash)
 
 
 def _place(line: Line) -> tuple[str, str, str, int]:
     return line.recipe, line.data_recipe, line.scene, line.seed
-
-
-def _line(*row: str) -> Line:
-    line = Line(*row)  # pyright: ignore[reportArgumentType]
-    value = float(line.value) if line.value else math.nan
-    if line.value and not math.isfinite(value):
-        raise ValueError(f"value {line.value}")
-    return line._replace(
-        seed=int(line.seed),
-        results_version=int(line.results_version),
-        value=value,
-        **{name: getattr(line, name) or None for name in ("protocol", "commit", "cpu")},
-    )
 
 
 def tidy(lines: Sequence[Line]) -> pd.DataFrame:
@@ -167,22 +220,40 @@ def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def write_frame(frame: pd.DataFrame, results: Path) -> None:
-    """Write runs.csv, and runs.parquet where pyarrow is installed."""
-    cells: list[Sequence[str]] = []
-    for name in frame.columns:
-        column = frame[name].tolist()
-        # A text stands in thousands of lines: it is made a cell once.
-        known = {} if name == "value" else {value: csv_cell(value) for value in set(column)}
-        cells.append([known[value] if known else csv_cell(value) for value in column])
-    lines = [csv_line(frame.columns), *map(",".join, zip(*cells, strict=True)), ""]
-    write_changed(results / "runs.csv", to_bytes("\n".join(lines)))
+def write_lines(lines: Sequence[Line], results: Path) -> None:
+    """Write runs.csv, a row per run, and categories.csv; and runs.parquet, as `tidy` has it, where pyarrow is installed.
+
+    What could not be computed is an empty cell, and a metric that no run has is no column.
+    """
+    runs: dict[str, tuple[Line, dict[str, float]]] = {}
+    categories = [csv_line(CATEGORY_COLUMNS)]
+    for line in lines:
+        _, metrics = runs.setdefault(line.config_hash, (line, {}))
+        if math.isnan(line.value):
+            continue
+        if line.metric == PER_CATEGORY:
+            cells = (line.config_hash, line.category, line.kind, _shortest(line.value))
+            categories.append(csv_line(cells))
+        else:
+            metrics[line.metric] = line.value
+    names = sorted({name for _, metrics in runs.values() for name in metrics})
+    rows = [csv_line([*RUN_COLUMNS, *names])]
+    for first, metrics in runs.values():
+        values = [_shortest(metrics[name]) if name in metrics else None for name in names]
+        rows.append(csv_line([*first[: len(RUN_COLUMNS)], *values]))
+    write_changed(results / "categories.csv", to_bytes("\n".join([*categories, ""])))
+    write_changed(results / "runs.csv", to_bytes("\n".join([*rows, ""])))
     try:
-        parquet = frame.to_parquet(index=False)
+        parquet = tidy(lines).to_parquet(index=False)
     except ImportError:
         return
     assert parquet is not None
     write_atomically(results / "runs.parquet", parquet)
+
+
+def _shortest(value: float) -> float | int:
+    """A whole number without a point; nothing is rounded."""
+    return int(value) if value.is_integer() and abs(value) < 2**53 else value
 
 
 def require_one_meaning(frame: pd.DataFrame, results: Path) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from vlgs.identity import RESULTS_VERSION
 from vlgs.tables.fill import Filled, Place
 from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE
@@ -50,7 +51,7 @@ class Grid:
     headers: tuple[str, ...]
     lines: tuple[Line, ...]
     per_run: tuple[str, ...]
-    """With `by: category`: lines are categories, entries these rows of the table, and their difference."""
+    """With `by: category`: lines are categories, entries these rows of the table, and the first minus the last."""
 
 
 def number(value: float, digits: int, signed: bool = False) -> str:
@@ -73,13 +74,9 @@ def arrange(filled: Filled) -> Grid:
     for index, row in enumerate(table.rows):
         entries = tuple(cells[Place(index, c, m)] for c, m in columns)
         lines.append(Line(row.group, row.label, tuple(row.marks.values()), entries))
-    several = len(table.metrics) > 1
-    headers = tuple(
-        (QUANTITIES[m].header if len(filled.columns) == 1 else f"{c} {QUANTITIES[m].header}")
-        if several
-        else c
-        for c, m in columns
-    )
+    single = len(filled.columns) == 1
+    titles = {m: QUANTITIES[m].title for m in table.metrics}
+    headers = tuple(titles[m] if single else f"{c} {titles[m]}" for c, m in columns)
     mark_names = next((tuple(row.marks) for row in table.rows if row.marks), ())
     return Grid(mark_names, columns, headers, tuple(_ranked(lines, columns)), ())
 
@@ -90,22 +87,24 @@ def _by_category(filled: Filled, cells: Mapping[Place, Entry]) -> Grid:
     for category in filled.columns:
         entries = tuple(cells[Place(index, category, metric)] for index in range(len(table.rows)))
         first, last = entries[0], entries[-1]
-        gain = Entry(
-            last.mean - first.mean,
+        less = Entry(
+            first.mean - last.mean,
             math.nan,
             min(first.seeds, last.seeds),
-            last.paper - first.paper,
-            (last.mean - first.mean) - (last.paper - first.paper),
+            first.paper - last.paper,
+            (first.mean - last.mean) - (first.paper - last.paper),
             first.digits,
         )
-        lines.append(Line(filled.kinds.get(category, ""), category, (), (*entries, gain)))
+        lines.append(Line(filled.kinds.get(category, ""), category, (), (*entries, less)))
     labels = tuple(row.label for row in table.rows)
-    columns = tuple((label, metric) for label in (*labels, "Gain"))
-    return Grid((), columns, (*labels, "Gain"), tuple(lines), labels)
+    names = (*labels, f"{labels[0]} minus {labels[-1]}")
+    columns = tuple((name, metric) for name in names)
+    headers = tuple(f"{name} ({QUANTITIES[metric].unit})" for name in names)
+    return Grid((), columns, headers, tuple(lines), labels)
 
 
 def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Line]:
-    """Mark the best and the second of every column; groups are ranked apart, equal prints share a rank."""
+    """Mark the best and the second of every column; groups are ranked apart, equal prints share a rank, and one seed has none."""
     ranked = {}
     for group in dict.fromkeys(line.group for line in lines):
         members = [i for i, line in enumerate(lines) if line.group == group]
@@ -115,6 +114,7 @@ def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Lin
                 i: round(lines[i].entries[column].mean, quantity.digits)
                 for i in members
                 if math.isfinite(lines[i].entries[column].mean)
+                and lines[i].entries[column].seeds > 1
             }
             best = sorted(set(printed.values()), reverse=quantity.higher_is_better)[:2]
             if len(best) < 2:
@@ -137,23 +137,35 @@ def _ranked(lines: list[Line], columns: tuple[tuple[str, str], ...]) -> list[Lin
 
 
 def caption(filled: Filled) -> str:
-    """The registry's caption and what the numbers are."""
+    """The registry's caption and what the numbers and brackets are."""
+    table, benchmark = filled.table, filled.benchmark.name
     seeds = sorted({cell.seeds for cell in filled.cells.values() if cell.seeds})
     if not seeds:
         said = "No runs yet."
     elif seeds == [1]:
-        said = "One seed, hence no deviation."
+        said = "One seed, hence no deviation and no claim."
     else:
         spread = "-".join(str(s) for s in sorted({seeds[0], seeds[-1]}))
-        said = f"Mean +- standard deviation over {spread} seeds."
-    parts = [filled.table.caption, said]
-    if not filled.same_scenes and any(row.paper for row in filled.table.rows):
+        said = f"Mean +- standard deviation over {spread} seeds; best of a group bold, second underlined."
+        said += " One seed has no deviation, no rank and makes no claim." * (seeds[0] == 1)
+    parts = [table.caption, said]
+    if table.same_runs_as and not filled.same_scenes:
         parts.append(
-            f"Scenes are those of {filled.benchmark.name}, not the paper's ({filled.table.dataset}), whose averages stand "
-            f"beside ours for the order of rows only."
+            f"The same runs as in tab:{table.same_runs_as}; only the paper's values are others."
+        )
+    if has_paper(filled) and filled.same_scenes:
+        parts.append("In brackets: the paper's value, and ours minus it.")
+    elif has_paper(filled):
+        parts.append(
+            f"In brackets: the paper's average, of its own scenes ({table.dataset}). Ours are those of {benchmark}, so that only the "
+            "order of rows can be compared."
         )
     if not all(math.isfinite(cell.mean) for cell in filled.cells.values()):
         parts.append(f"{MISSING}: no run, or a score that a method does not have.")
+    if filled.results_version not in (0, RESULTS_VERSION):
+        parts.append(
+            f"Runs of results version {filled.results_version}, by earlier code; today's is version {RESULTS_VERSION}."
+        )
     return " ".join(parts)
 
 

@@ -14,7 +14,7 @@ from vlgs.tables import plots
 from vlgs.tables.fill import Filled
 from vlgs.tables.frame import Line
 from vlgs.tables.grid import arrange, caption, has_paper, number
-from vlgs.tables.statistics import sentence
+from vlgs.tables.said import say
 from vlgs.text import to_bytes, visible
 
 
@@ -33,10 +33,10 @@ def write_report(
     pictures.mkdir(exist_ok=True)
 
     def keep(name: str, png: bytes | None) -> str:
-        if png is None:
-            return ""
-        write_atomically(pictures / f"{name}.png", png)
-        return f"plots/{name}.png"
+        if png is not None:
+            write_atomically(pictures / f"{name}.png", png)
+        # Curves need the folders of runs, which a clone does not have: it shows those that were drawn where they lay.
+        return f"plots/{name}.png" if (pictures / f"{name}.png").is_file() else ""
 
     hashes = {name for table in filled for name in table.runs["config_hash"]}
     mine = frame[frame["config_hash"].isin(hashes)]
@@ -65,15 +65,13 @@ def write_report(
         tables=[
             _section(table, keep(table.table.label, plots.rows_compared(table))) for table in filled
         ],
-        whole=[(title, keep(name, png)) for title, name, png in whole if png is not None],
-        provenance=filled[0].provenance if filled else [],
+        whole=[(title, path) for title, name, png in whole if (path := keep(name, png))],
     )
     write_atomically(folder / "index.html", to_bytes(text))
 
 
 def _section(filled: Filled, picture: str) -> dict[str, Any]:
     grid, paper = arrange(filled), has_paper(filled)
-    by_category = filled.table.by_category
     return {
         "label": filled.table.label,
         "caption": caption(filled),
@@ -98,7 +96,8 @@ def _section(filled: Filled, picture: str) -> dict[str, Any]:
             }
             for line in grid.lines
         ],
-        "said": [] if by_category else [sentence(filled, m) for m in filled.table.metrics],
+        "said": say(filled),
+        "provenance": filled.provenance,
         "picture": picture,
     }
 

@@ -1,16 +1,17 @@
 """Tables as Markdown and CSV."""
 
 import math
+from collections.abc import Sequence
 
 from vlgs.tables.fill import Cell, Filled, Place
 from vlgs.tables.grid import Entry, arrange, caption, has_paper, number
-from vlgs.tables.statistics import sentence
+from vlgs.tables.said import say
 from vlgs.text import csv_line, visible
 from vlgs.text import markdown as escape
 
 
 def to_markdown(filled: Filled) -> str:
-    """Caption, table, what it says about the paper's claims, and where the numbers come from."""
+    """Caption, table, what may be claimed of it, and where the numbers come from."""
     grid, paper = arrange(filled), has_paper(filled)
     grouped = any(line.group for line in grid.lines)
     head = [*([""] if grouped else []), "", *map(escape, (*grid.mark_names, *grid.headers))]
@@ -22,20 +23,21 @@ def to_markdown(filled: Filled) -> str:
         rows.append(
             [*([escape(line.group)] if grouped else []), escape(line.label), *marks, *cells]
         )
-    table = "\n".join("| " + " | ".join(row) + " |" for row in rows)
-    said = (
-        []
-        if filled.table.by_category
-        else [escape(sentence(filled, m)) for m in filled.table.metrics]
-    )
+    said = say(filled)
+    claims = [said.head, ["---"] * len(said.head), *said.lines] if said.lines else []
+    paragraphs = [
+        escape(said.before),
+        _table([[*map(escape, r)] for r in claims]),
+        escape(said.after),
+    ]
     notes = [f"- {escape(row.label)}: {escape(row.ours)}" for row in filled.table.rows if row.ours]
     return (
         "\n\n".join(
             [
                 f"# tab:{filled.table.label}",
                 escape(caption(filled)),
-                table,
-                *said,
+                _table(rows),
+                *filter(None, paragraphs),
                 *notes,
                 "\n".join(map(escape, filled.provenance)),
             ]
@@ -54,6 +56,10 @@ def to_csv(filled: Filled) -> str:
     head = ("group", "label", *Place._fields[1:], *Cell._fields)
     lines = [f"# {visible(line)}" for line in filled.provenance]
     return "\n".join([*lines, *(csv_line(row, digits=4) for row in [head, *cells]), ""])
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def _cell(entry: Entry, paper: bool) -> str:

@@ -49,9 +49,8 @@ def rows_compared(filled: Filled) -> bytes | None:
     with _png(6.4, 0.6 + 0.16 * len(lines) * max(len(series), 1.6)) as (axes, file):
         _draw(axes, lines, series, grid.headers)
         quantity = QUANTITIES[metric]
-        axes.set_xlabel(
-            f"{quantity.header} ({quantity.unit})" if quantity.unit else quantity.header
-        )
+        bars = any(math.isfinite(line.entries[i].std) for line in lines for i in series)
+        axes.set_xlabel(quantity.title + "; bars: one standard deviation over seeds" * bars)
         if len(series) > 1:
             axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return file.getvalue()

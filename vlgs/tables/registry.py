@@ -42,6 +42,9 @@ _TABLE_KEYS = {
     "metrics",
     "by",
     "categories",
+    "seeds",
+    "elsewhere",
+    "same_runs_as",
     "rows",
 }
 _ROW_KEYS = {"label", "set", "group", "marks", "paper", "ours"}
@@ -85,8 +88,18 @@ class Table:
     """Number of the table in the paper's PDF, by which comments cite it; None for a table of our own."""
     kinds: Mapping[str, str] = field(default_factory=lambda: _EMPTY)
     """Category -> ``translucent_reflective`` or ``other``."""
+    seeds: tuple[int, ...] = ()
+    """The only seeds that are run; empty for those of the benchmark."""
+    elsewhere: str = ""
+    """Table that stands for this one on other scenes than the paper's, where this would say the same of other scenes again."""
+    same_runs_as: str = ""
+    """Table that has all of these rows, so that on other scenes than the paper's only the paper's values are others."""
     source: str = "sweeps"
     """File that it was read from, for errors."""
+
+    def chosen(self, seeds: Sequence[int]) -> tuple[int, ...]:
+        """Those of a benchmark's seeds that the table is made of."""
+        return tuple(seed for seed in seeds if not self.seeds or seed in self.seeds)
 
 
 def is_label(text: str) -> bool:
@@ -168,6 +181,9 @@ def load_table(path: Path) -> Table:
         rows=rows,
         by_category=by_category,
         kinds=kinds,
+        seeds=tuple(_require(where, content, "seeds", list, int)),
+        elsewhere=_require(where, content, "elsewhere", str),
+        same_runs_as=_require(where, content, "same_runs_as", str),
         source=where,
     )
 
@@ -251,7 +267,7 @@ def _require(
         if not odd:
             return value
         value = odd[0]
-    words = {str: "text", list: "list", dict: "mapping", bool: "true or false"}
+    words = {str: "text", list: "list", dict: "mapping", bool: "true or false", int: "whole number"}
     of = f" of {words[inner]}" if inner else ""
     raise ValueError(f"{where}: {key} must be a {words[kind]}{of}, got {briefly(value)}")
 

@@ -1,206 +1,269 @@
-"""Statistics of a table: paired differences from the full model, and agreement with the order of the rows in the paper."""
+"""What a table may claim: paired differences from the full model, effects of switches, and the order of the rows in the paper."""
 
 import itertools
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 
 from vlgs.tables.fill import Filled, Place
+from vlgs.tables.intervals import (
+    LEVEL,
+    Estimate,
+    holm,
+    kendall_tau,
+    on_scenes_like_these,
+    on_these_scenes,
+    probability_above,
+)
 from vlgs.tables.quantities import QUANTITIES
-from vlgs.tables.registry import AVERAGE
+from vlgs.tables.registry import AVERAGE, Row
 
-RESAMPLES = 10_000
-LEVEL = 0.95
-
-Verdict = Literal["holds", "reversed", "undecided", "no claim"]
+Verdict = Literal["holds", "reversed", "above", "below", "equivalent", "cannot be told", "no claim"]
+"""``holds`` and ``reversed`` are of the paper's sign, ``above`` and ``below`` 0 where it gives none, ``equivalent`` within the margin of the
+quantity. ``no claim``: too few seeds."""
 
 
 @dataclass(frozen=True)
-class Difference:
-    """One row against the full model, paired by scene and seed."""
+class Judged:
+    """An interval and what follows from it."""
 
-    row: int
+    low: float
+    high: float
+    df: float
+    p: float
+    """Of no difference, after Holm's correction over the table."""
+    verdict: Verdict
+    within: bool
+    """Whether it is shown to lie within the quantity's margin too, Holm's correction over the table's equivalences."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A row against the full model, or what a switch adds, paired by scene and seed."""
+
     label: str
     group: str
     metric: str
     mean: float
-    """Row minus full model, in printed units."""
-    low: float
-    high: float
-    """Bounds of the `LEVEL` confidence interval, bootstrapped over scenes and over seeds within them."""
-    pairs: int
+    """In printed units: row minus full model, or with minus without a switch."""
+    scenes: int
+    agree: int
+    """Scenes whose own mean has the sign of `mean`."""
+    seeds: int
+    """Fewest of any scene."""
+    better: float
+    """Probability that a run of the row is better than one of the full model; NaN for effects."""
     paper: float
     """The same difference in the paper's averages; NaN where the paper has none."""
-    verdict: Verdict
-    """Whether the paper's sign is confirmed: the interval lies on its side of 0, on the other, or around 0."""
+    here: Judged | None
+    """On these scenes; None with too few seeds."""
+    beyond: Judged | None
+    """On scenes like these; None with too few scenes."""
+    effect: bool = False
+    """Whether it is an effect in a table of all combinations of its switches."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """On these scenes."""
+        return self.here.verdict if self.here else "no claim"
 
 
-def paired_differences(filled: Filled, metric: str) -> list[Difference]:
-    """Every row against the full model of its group, or of the table where the group has none."""
-    table, out = filled.table, []
-    numbers: dict[int, dict[tuple[str, int], float]] = {}
-    for number in filled.numbers:
-        if number.metric == metric and number.column != AVERAGE:
-            numbers.setdefault(number.row, {})[number.column, number.seed] = number.value
-    for index, row in enumerate(table.rows):
-        reference = _full_model(filled, row.group)
+@dataclass(frozen=True)
+class Order:
+    """How well the order of rows agrees with the paper's."""
+
+    group: str
+    metric: str
+    tau: float
+    rows: int
+
+
+@dataclass(frozen=True)
+class _Contrast:
+    """A weighted sum of rows."""
+
+    label: str
+    group: str
+    metric: str
+    weights: Mapping[int, float]
+    effect: bool = False
+
+
+def claims(filled: Filled) -> list[Claim]:
+    """Every claim of a table, corrected as one family; quantities that are not judged (times) have none."""
+    metrics = [m for m in filled.table.metrics if QUANTITIES[m].judged]
+    wanted = [c for m in metrics for c in (*_against_full(filled, m), *_effects(filled, m))]
+    numbers = _numbers(filled)
+    found = [(c, pairs) for c in wanted if (pairs := _combined(c, numbers))]
+    here = _judge(filled, found, on_these_scenes)
+    beyond = _judge(filled, found, on_scenes_like_these)
+    return [
+        _claim(filled, c, pairs, numbers, one, other)
+        for (c, pairs), one, other in zip(found, here, beyond, strict=True)
+    ]
+
+
+def orders(filled: Filled) -> list[Order]:
+    """Kendall's tau between our averages and the paper's in each group, over the rows that have both; rows that are one run count once."""
+    found = []
+    for metric in filled.table.metrics:
+        if not QUANTITIES[metric].judged:
+            continue
+        for group in dict.fromkeys(row.group for row in filled.table.rows):
+            both: dict[tuple[str, ...], tuple[float, float]] = {}
+            for index, row in enumerate(filled.table.rows):
+                pair = _ours(filled, index, metric), _paper(filled, index, metric)
+                if row.group == group and not any(map(math.isnan, pair)):
+                    both.setdefault(row.overrides, pair)
+            tau = kendall_tau(*zip(*both.values(), strict=True)) if len(both) > 1 else math.nan
+            if math.isfinite(tau):
+                found.append(Order(group, metric, tau, len(both)))
+    return found
+
+
+def judge(p: float, mean: float, within: bool, paper: float) -> Verdict:
+    """What a corrected p-value and a difference say of the paper's sign."""
+    if p > 1 - LEVEL:
+        return "equivalent" if within else "cannot be told"
+    if not math.isfinite(paper) or paper == 0:
+        return "above" if mean > 0 else "below"
+    return "holds" if (mean > 0) == (paper > 0) else "reversed"
+
+
+def _judge(
+    filled: Filled,
+    found: Sequence[tuple[_Contrast, Mapping[str, np.ndarray]]],
+    estimate: Callable[[Sequence[np.ndarray]], Estimate | None],
+) -> list[Judged | None]:
+    estimates = [estimate(list(pairs.values())) for _, pairs in found]
+    known = {i: one for i, one in enumerate(estimates) if one is not None}
+    different = dict(zip(known, holm([one.differs() for one in known.values()]), strict=True))
+    margins = {i: QUANTITIES[found[i][0].metric].margin for i in known}
+    beside = {i: known[i].within(margin) for i, margin in margins.items() if margin is not None}
+    alike = dict(zip(beside, holm(list(beside.values())), strict=True))
+    judged: list[Judged | None] = []
+    for index, ((contrast, _), one) in enumerate(zip(found, estimates, strict=True)):
+        if one is None:
+            judged.append(None)
+            continue
+        p, within = different[index], alike.get(index, 1.0) <= 1 - LEVEL
+        paper = _of_paper(filled, contrast)
+        verdict = judge(p, one.mean, within, paper)
+        judged.append(Judged(*one.interval(), one.df, p, verdict, within))
+    return judged
+
+
+def _claim(
+    filled: Filled,
+    contrast: _Contrast,
+    pairs: Mapping[str, np.ndarray],
+    numbers: Mapping[tuple[int, str], Mapping[str, Mapping[int, float]]],
+    here: Judged | None,
+    beyond: Judged | None,
+) -> Claim:
+    means = [float(part.mean()) for part in pairs.values()]
+    mean, better = statistics.fmean(means), math.nan
+    if not contrast.effect:
+        both = [numbers[row, contrast.metric] for row in contrast.weights]
+        runs = [[np.array(list(one[scene].values())) for scene in pairs] for one in both]
+        better = probability_above(runs[0], runs[1], QUANTITIES[contrast.metric].higher_is_better)
+    return Claim(
+        label=contrast.label,
+        group=contrast.group,
+        metric=contrast.metric,
+        mean=mean,
+        scenes=len(means),
+        agree=sum(bool(np.sign(one) == np.sign(mean)) for one in means),
+        seeds=min(map(len, pairs.values())),
+        better=better,
+        paper=_of_paper(filled, contrast),
+        here=here,
+        beyond=beyond,
+        effect=contrast.effect,
+    )
+
+
+def _numbers(filled: Filled) -> dict[tuple[int, str], dict[str, dict[int, float]]]:
+    """Row and metric -> scene -> seed -> value."""
+    found: dict[tuple[int, str], dict[str, dict[int, float]]] = {}
+    for n in sorted(filled.numbers):  # in whatever order runs are read
+        if n.column != AVERAGE:
+            found.setdefault((n.row, n.metric), {}).setdefault(n.column, {})[n.seed] = n.value
+    return found
+
+
+def _combined(
+    contrast: _Contrast, numbers: Mapping[tuple[int, str], Mapping[str, Mapping[int, float]]]
+) -> dict[str, np.ndarray]:
+    """Scene -> the weighted sum for every seed that all rows have."""
+    parts = [(numbers.get((row, contrast.metric), {}), w) for row, w in contrast.weights.items()]
+    scenes = [scene for scene in parts[0][0] if all(scene in part for part, _ in parts)]
+    found = {}
+    for scene in scenes:
+        seeds = [seed for seed in parts[0][0][scene] if all(seed in p[scene] for p, _ in parts)]
+        if seeds:
+            sums = [sum(w * part[scene][seed] for part, w in parts) for seed in seeds]
+            found[scene] = np.array(sums)
+    return found
+
+
+def _against_full(filled: Filled, metric: str) -> Iterator[_Contrast]:
+    """Every row against the full model of its group, or of the table where the group has none; a run that has several rows in a group once."""
+    if filled.table.by_category:
+        return
+    seen = set()
+    for index, row in enumerate(filled.table.rows):
+        reference = full_model(filled.table.rows, row.group)
         if reference is None or index == reference or not row.overrides:
             continue
-        mine, full = numbers.get(index, {}), numbers.get(reference, {})
-        pairs: dict[str, list[float]] = {}
-        for (column, seed), value in sorted(mine.items()):  # in whatever order runs are read
-            if (column, seed) in full:
-                pairs.setdefault(column, []).append(value - full[column, seed])
-        if not pairs:
-            continue
-        by_scene = [np.array(part) for part in pairs.values()]
-        low, high = bootstrap_interval(by_scene, seed=index)
-        paper = _paper(filled, index, metric) - _paper(filled, reference, metric)
-        mean = float(np.mean([part.mean() for part in by_scene]))
-        verdict = judge(low, high, paper)
-        out.append(
-            Difference(
-                index,
-                row.label,
-                row.group,
-                metric,
-                mean,
-                low,
-                high,
-                sum(map(len, by_scene)),
-                paper,
-                verdict,
-            )
-        )
-    return out
+        key = row.group, frozenset(row.overrides)
+        if key not in seen:
+            seen.add(key)
+            yield _Contrast(row.label, row.group, metric, {index: 1.0, reference: -1.0})
 
 
-def bootstrap_interval(by_scene: Sequence[np.ndarray], seed: int) -> tuple[float, float]:
-    """Percentile interval of the mean over scenes of the mean over seeds.
+def _effects(filled: Filled, metric: str) -> Iterator[_Contrast]:
+    """What each switch adds on average over the others, and each product of switches; only where every combination has one row.
 
-    Scenes are drawn with replacement, then seeds within each; with a single number the interval is all reals.
-
-    Args:
-        by_scene: Differences of each scene, one per seed.
-        seed: Of the draws.
+    The product of two is half of how much more the one adds with the other than without it.
     """
-    if sum(len(part) for part in by_scene) < 2:
-        return -math.inf, math.inf
-    means = _resampled(tuple(map(len, by_scene)), seed) @ np.concatenate(by_scene)
-    tail = (1 - LEVEL) / 2
-    low, high = np.quantile(means, [tail, 1 - tail])
-    return float(low), float(high)
+    rows = filled.table.rows
+    names = tuple(rows[0].marks)
+    combinations = [tuple(row.marks.values()) for row in rows]
+    complete = len(set(combinations)) == len(rows) == 2 ** len(names)
+    if filled.table.by_category or len(names) < 2 or not complete:
+        return
+    scale = 2.0 ** (1 - len(names))
+    for size in range(1, len(names) + 1):
+        for chosen in itertools.combinations(range(len(names)), size):
+            signs = [math.prod(1 if marks[i] else -1 for i in chosen) for marks in combinations]
+            label = " x ".join(names[i] for i in chosen)
+            weights = {index: scale * sign for index, sign in enumerate(signs)}
+            yield _Contrast(label, "", metric, weights, effect=True)
 
 
-@lru_cache(maxsize=64)
-def _resampled(sizes: tuple[int, ...], seed: int) -> np.ndarray:
-    """Weights of all numbers, scene after scene, in each of `RESAMPLES` means; the rows of many tables share them."""
-    rng = np.random.default_rng(seed)
-    draws, most = np.arange(RESAMPLES)[:, None, None], max(sizes)
-    scenes = rng.integers(len(sizes), size=(RESAMPLES, len(sizes)))  # [b, k]
-    drawn = np.array(sizes)[scenes][..., None]  # seeds of the scene that was drawn, [b, k, 1]
-    seeds = (rng.random((*scenes.shape, most)) * drawn).astype(int)
-    counts = np.arange(most) < drawn
-    weights = np.zeros((RESAMPLES, sum(sizes)))
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    np.add.at(
-        weights, (draws, starts[scenes][..., None] + seeds * counts), counts / drawn / len(sizes)
-    )
-    return weights
-
-
-def judge(low: float, high: float, paper: float) -> Verdict:
-    """Set an interval against the sign of the paper's difference."""
-    if not math.isfinite(paper) or paper == 0:
-        return "no claim"
-    if low <= 0 <= high:
-        return "undecided"
-    return "holds" if (low > 0) == (paper > 0) else "reversed"
-
-
-def kendall_tau(ours: Sequence[float], papers: Sequence[float]) -> float:
-    """Kendall's tau-b of two orders; NaN with fewer than two rows or where one order is a tie throughout."""
-    concordant = ties_ours = ties_papers = total = 0
-    for (a, x), (b, y) in itertools.combinations(zip(ours, papers, strict=True), 2):
-        total += 1
-        ties_ours += a == b
-        ties_papers += x == y
-        concordant += int(np.sign(a - b) * np.sign(x - y))
-    scale = math.sqrt((total - ties_ours) * (total - ties_papers))
-    return concordant / scale if scale else math.nan
-
-
-def order_agreement(filled: Filled, metric: str) -> float:
-    """Kendall's tau between our averages and the paper's, over the rows that have both; see `kendall_tau`."""
-    ours, papers, seen = [], [], set()
-    for index, row in enumerate(filled.table.rows):
-        mine, theirs = _ours(filled, index, metric), _paper(filled, index, metric)
-        key = row.overrides
-        if key in seen or math.isnan(mine) or math.isnan(theirs):
-            continue  # rows that are one run count once
-        seen.add(key)
-        ours.append(mine)
-        papers.append(theirs)
-    return kendall_tau(ours, papers)
-
-
-def sentence(filled: Filled, metric: str) -> str:
-    """Which claims of the paper hold on this data, which do not, and which it cannot tell."""
-    differences = paired_differences(filled, metric)
-    if not differences:
-        return (
-            "No row can be compared: there is no run of the full model together with another row."
-        )
-    quantity = QUANTITIES[metric]
-
-    def show(d: Difference) -> str:
-        title = f"{d.group.partition(':')[0]} {d.label}".strip()
-        interval = (
-            f"[{d.low:+.{quantity.digits}f}, {d.high:+.{quantity.digits}f}]"
-            if math.isfinite(d.low)
-            else "[one pair, no interval]"
-        )
-        return f"{title} {d.mean:+.{quantity.digits}f} {interval}" + (
-            f" (paper {d.paper:+.{quantity.digits}f})" if math.isfinite(d.paper) else ""
-        )
-
-    parts = [
-        f"{quantity.header} against the full model, {LEVEL:.0%} intervals over scenes and seeds."
-    ]
-    for verdict, words in (
-        ("holds", "The paper's sign holds for"),
-        ("reversed", "It is reversed for"),
-        ("undecided", "The data cannot tell for"),
-        ("no claim", "The paper gives no number for"),
-    ):
-        rows = [show(d) for d in differences if d.verdict == verdict]
-        if rows:
-            parts.append(f"{words} {'; '.join(rows)}.")
-    tau = order_agreement(filled, metric)
-    if math.isfinite(tau):
-        parts.append(f"Kendall's tau with the paper's order of rows: {tau:+.2f}.")
-    return " ".join(parts)
-
-
-def _full_model(filled: Filled, group: str) -> int | None:
-    rows = list(enumerate(filled.table.rows))
-    full = [i for i, row in rows if row.overrides == ()]
-    own = [i for i in full if filled.table.rows[i].group == group]
+def full_model(rows: Sequence[Row], group: str) -> int | None:
+    """Row that a group's rows are compared with."""
+    full = [i for i, row in enumerate(rows) if row.overrides == ()]
+    own = [i for i in full if rows[i].group == group]
     # A group on other data has a full model of its own: the row that changes nothing but the data.
     moved = [
         i
-        for i, row in rows
+        for i, row in enumerate(rows)
         if group
         and row.group == group
         and row.overrides
         and all(word.startswith("data.") for word in row.overrides)
     ]
     return (own or moved or full or [None])[0]
+
+
+def _of_paper(filled: Filled, contrast: _Contrast) -> float:
+    return sum(w * _paper(filled, row, contrast.metric) for row, w in contrast.weights.items())
 
 
 def _ours(filled: Filled, row: int, metric: str) -> float:
