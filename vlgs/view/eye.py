@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat, scene_extent
+from vlgs.opened.cameras import focus, upright
 from vlgs.types import Camera
 
 _NEAREST = 0.1
@@ -65,7 +66,7 @@ class Surroundings:
     """What the cameras of a scene tell of it."""
 
     up: tuple[float, ...]
-    """Away from the ground: the mean of what is up in the photographs."""
+    """Away from the ground."""
     focus: Float[Tensor, " 3"]
     """The point that the cameras look at."""
     nearest: float
@@ -89,16 +90,8 @@ class Surroundings:
 
 
 def surroundings(cameras: Sequence[Camera]) -> Surroundings:
-    """Up, and the point that is nearest to all optical axes in the sense of least squares."""
-    viewmats = torch.stack([camera.viewmat for camera in cameras])
-    down = viewmats[:, 1, :3].mean(dim=0)
-    up = -down / down.norm() if down.norm() > 1e-3 else torch.tensor([0.0, 0.0, 1.0])
-    axes, centers = viewmats[:, 2, :3], camera_center(viewmats)
-    across = (
-        torch.eye(3) - axes[:, :, None] * axes[:, None, :]
-    )  # [v, 3, 3], takes off what lies along an axis
-    # Parallel axes meet nowhere: the point is then near the cameras, and `nearest` decides.
-    matrix = across.mean(dim=0) + 1e-6 * torch.eye(3)
-    target = (across @ centers[..., None]).mean(dim=0)[:, 0] + 1e-6 * centers.mean(dim=0)
-    nearest = _NEAREST * scene_extent(viewmats)
-    return Surroundings(tuple(up.tolist()), torch.linalg.solve(matrix, target), nearest)
+    """What is up, and the point that the optical axes pass nearest to (`vlgs.opened.cameras`)."""
+    viewmats = torch.stack([camera.viewmat for camera in cameras]).double()
+    target = focus(camera_center(viewmats), viewmats[:, 2, :3])
+    up = tuple(upright(viewmats).tolist())
+    return Surroundings(up, target.float(), _NEAREST * scene_extent(viewmats))
