@@ -26,7 +26,7 @@ class Video:
 
     def __init__(self, path: Path, fps: float, quality: int = 18) -> None:
         require_extra("av", "video")
-        import av
+        import av  # pyright: ignore[reportMissingImports]
 
         self.path = path
         self.buffer = io.BytesIO()
@@ -43,7 +43,7 @@ class Video:
         Raises:
             ValueError: If it has another size than the first.
         """
-        import av
+        import av  # pyright: ignore[reportMissingImports]
 
         h, w = picture.shape[:2]
         if self.size is None:
