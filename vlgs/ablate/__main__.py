@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -164,8 +165,8 @@ def ablate(request: Request) -> int:
         return 0
     benchmark.extend(results / benchmark.name / "benchmark.yaml")
     composer.save()
-    # A folder of this process alone: two ablations at once neither mix their logs nor stop each other.
-    folder = results / "logs" / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"
+    # A folder of this call alone: two ablations neither mix their logs nor read each other's stop file.
+    folder = results / "logs" / f"{datetime.now():%Y%m%d-%H%M%S.%f}-{os.getpid()}"
     tally = Tally()
     with stop_file(folder / STOP) as stopping:
         _run_missing(request, planned, folder, tally, stopping, console)
