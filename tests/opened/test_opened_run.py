@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,14 @@ def test_words_are_asked_by_the_runs_query(opened: OpenedRun):
         opened.ask(["mugg"])
     with pytest.raises(ValueError, match="at least one word"):
         opened.ask([])
+
+
+def test_a_field_that_answers_for_all_mask_levels_has_none_to_choose(opened: OpenedRun):
+    """As LERF, which is taught by three levels and answers once."""
+    taught = replace(opened, notes=replace(opened.notes, levels=(1, 2, 3)))
+    assert (opened.levels, taught.levels) == ((3,), ())
+    with pytest.raises(ValueError, match="none, as it answers for all at once, got 2"):
+        taught.place(2)
 
 
 @pytest.mark.parametrize("levels", ["separate", "joint"])

@@ -74,7 +74,7 @@ def export(opened: OpenedRun, target: Path, wanted: Wanted) -> list[str]:
         raise ValueError(f"export: --words must go with .html, got {target.name}: --select WORD")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"export: OUT must be in a folder that exists, got {target}")
-    level = _place(opened, wanted.level)
+    level = None if wanted.level is None else opened.place(wanted.level)
     if wanted.select is not None:
         content = selected(opened, wanted.select, level)
     else:
@@ -112,19 +112,3 @@ def _words(opened: OpenedRun, kind: str, wanted: Wanted) -> Sequence[str]:
     if wanted.words is not None:
         return tuple(dict.fromkeys(wanted.words))
     return opened.notes.classes if opened.field.has_language else ()
-
-
-def _place(opened: OpenedRun, number: int | None) -> int | None:
-    """Place of a mask level among those of the field.
-
-    Raises:
-        ValueError: If it has no such level.
-    """
-    if number is None:
-        return None
-    place = opened.place(number)
-    if place >= len(opened.field.levels()):
-        raise ValueError(
-            f"{opened.path}: level must not be given where all levels answer as one, got {number}"
-        )
-    return place

@@ -1,10 +1,9 @@
 """Write a trained scene to one file: `python -m vlgs.export RUN OUT`; see `--help`."""
 
-import argparse
 from pathlib import Path
 
 from vlgs.export import Wanted, export, kind_of
-from vlgs.opened.commands import add_words, command, opened
+from vlgs.opened.commands import add_words, command, new_parser, opened
 from vlgs.text import screen
 
 _HELP = """OUT, by suffix:
@@ -19,12 +18,7 @@ All hold colours as they are drawn, with no fusion left to be done. `python -m v
 
 def main(arguments: list[str] | None = None) -> None:
     """Export one run; exit status 1 with one line if it cannot be done."""
-    parser = argparse.ArgumentParser(
-        prog="python -m vlgs.export",
-        description=__doc__,
-        epilog=_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("vlgs.export", __doc__, _HELP)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument(

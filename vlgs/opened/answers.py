@@ -103,7 +103,20 @@ def ranges(
         asked: The words.
         chosen: Place of the mask level; None: the best of each view.
     """
-    answers = [ask_view(field, camera, asked) for camera in spread(cameras, _LOOKED_AT)]
+    return ranges_of(
+        [ask_view(field, camera, asked) for camera in looked_at(cameras)], asked, chosen
+    )
+
+
+def looked_at(cameras: Sequence[Camera]) -> Sequence[Camera]:
+    """Those of a scene's cameras from which a range is found."""
+    return spread(cameras, _LOOKED_AT)
+
+
+def ranges_of(
+    answers: Sequence[Answers], asked: Questions, chosen: int | None = None
+) -> list[Range]:
+    """`ranges` of views that were asked already."""
     least, found = tie(asked.query, len(asked.prompts.names)), []
     for word in range(len(asked.prompts.names)):
         maps = [answer.relevancy[answer.level(word, chosen), word] for answer in answers]

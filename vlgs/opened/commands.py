@@ -16,6 +16,16 @@ if TYPE_CHECKING:
     from vlgs.opened.run import OpenedRun
 
 
+def new_parser(module: str, description: str | None, epilog: str) -> argparse.ArgumentParser:
+    """The parser of a command, whose help keeps the line breaks of both texts."""
+    return argparse.ArgumentParser(
+        prog=f"python -m {module}",
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def add_words(parser: argparse.ArgumentParser) -> None:
     """Options that say where vectors of words come from, and how many threads there are."""
     group = parser.add_argument_group("words that the run's vocabulary lacks")

@@ -44,6 +44,12 @@ class OpenedRun:
         """Where photographs were taken: of one split, ``train`` or ``test``, or all."""
         return [one for one in self.notes.cameras if split in (None, one.split)]
 
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """Mask levels that can be asked for, as the data number them, in the order of the field; none where it answers for all at once."""
+        known = tuple(level for level in self.notes.levels if level is not None)
+        return known if len(known) == len(self.field.levels()) else ()
+
     def held_out(self) -> Sequence[NamedCamera]:
         """Cameras of held-out photographs; where there are none, all."""
         return self.cameras("test") or self.cameras()
@@ -52,16 +58,12 @@ class OpenedRun:
         """Place of a mask level among those of the field.
 
         Raises:
-            ValueError: If the run has no such level.
+            ValueError: If it cannot be asked for.
         """
-        if level not in self.notes.levels:
-            known = (
-                ", ".join(map(str, self.notes.levels))
-                if self.notes.levels[0] is not None
-                else "none"
-            )
+        if level not in self.levels:
+            known = ", ".join(map(str, self.levels)) or "none, as it answers for all at once"
             raise ValueError(f"{self.path}: level must be one of the run's, {known}, got {level}")
-        return self.notes.levels.index(level)
+        return self.levels.index(level)
 
     def ask(self, words: Sequence[str]) -> Questions:
         """Words together with all that a query needs for them.

@@ -3,13 +3,13 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlgs.names import file_names
-from vlgs.opened.commands import add_words, command, opened
+from vlgs.opened.commands import add_words, command, new_parser, opened
 from vlgs.text import screen
 from vlgs.values import require_range
 
@@ -51,12 +51,7 @@ class Row:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Answer on the screen and in pictures; exit status 1 and one line where that cannot be."""
-    parser = argparse.ArgumentParser(
-        prog="python -m vlgs.query",
-        description=__doc__,
-        epilog=_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("vlgs.query", __doc__, _HELP)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, finished or not")
     parser.add_argument(
         "words", nargs="+", metavar="WORD", help='what to look for: "glass of water"'
@@ -99,19 +94,22 @@ def query(args: argparse.Namespace) -> None:
     """
     require_range("query", 0, 1, threshold=args.threshold)
     run = opened(args)
-    from vlgs.opened.answers import SHARE, ranges
+    from vlgs.opened.answers import SHARE, ask_view, looked_at, ranges_of
 
     asked = run.ask(list(dict.fromkeys(args.words)))
     place = None if args.level is None else run.place(args.level)
     views = _views(run, args)
-    bounds = ranges(run.field, [one.camera for one in run.held_out()], asked, place)
+    cameras = looked_at([one.camera for one in run.held_out()])
+    # Most are among the views that are asked for, and need not be asked again.
+    known = {id(camera): ask_view(run.field, camera, asked) for camera in cameras}
+    bounds = ranges_of([*known.values()], asked, place)
     share = SHARE if args.threshold is None else args.threshold
     if args.select is not None:
         count = _select(run, asked, bounds[0].threshold(share), place, args.select)
         line = f"{args.select}: {count} Gaussians answer {asked.prompts.names[0]!r}"
         print(screen(line), file=sys.stderr)
     out = None if args.no_pictures else (args.out or args.run / "answers")
-    rows = _rows(run, asked, views, place, bounds, share, out)
+    rows = _rows(run, asked, views, known, place, bounds, share, out)
     if args.json:
         print(json.dumps(_as_json(run, asked, rows), indent=1, ensure_ascii=False))
     else:
@@ -135,20 +133,21 @@ def _rows(
     run: "OpenedRun",
     asked: "Questions",
     views: Sequence["NamedCamera"],
+    known: Mapping[int, "Answers"],
     place: int | None,
     bounds: Sequence["Range"],
     share: float,
     out: Path | None,
 ) -> list[Row]:
-    """Of every word the views, the best first."""
+    """Of every word the views, the best first. No more than one view is held beside those that are known."""
     from vlgs.opened.answers import ask_view
 
-    answers = [ask_view(run.field, view.camera, asked) for view in views]
     folders, files = file_names(asked.prompts.names), file_names(view.name for view in views)
     rows: list[Row] = []
-    for word, name in enumerate(asked.prompts.names):
-        threshold, found = bounds[word].threshold(share), list[Row]()
-        for view, answer in zip(views, answers, strict=True):
+    for view in views:
+        answer = known.get(id(view.camera)) or ask_view(run.field, view.camera, asked)
+        for word, name in enumerate(asked.prompts.names):
+            threshold = bounds[word].threshold(share)
             at = answer.level(word, place)
             relevancy, written = answer.relevancy[at, word], dict[str, str]()
             answering = relevancy > threshold
@@ -160,9 +159,9 @@ def _rows(
             part = float(answering.float().mean())
             score = answer.score(word, place)
             level = _level(run, at)
-            found.append(Row(name, view, scores, level, score, (x, y), part, threshold, written))
-        rows += sorted(found, key=lambda row: row.score, reverse=True)
-    return rows
+            rows.append(Row(name, view, scores, level, score, (x, y), part, threshold, written))
+    order = asked.prompts.names.index
+    return sorted(rows, key=lambda row: (order(row.word), -row.score))
 
 
 def _draw(stem: Path, answer: "Answers", shares: "Tensor", answering: "Tensor") -> dict[str, str]:
@@ -201,8 +200,7 @@ def _select(
 
 
 def _level(run: "OpenedRun", place: int) -> str:
-    level = run.notes.levels[place] if place < len(run.notes.levels) else None
-    return "-" if level is None else str(level)
+    return str(run.levels[place]) if run.levels else "-"
 
 
 def _as_json(run: "OpenedRun", asked: "Questions", rows: Sequence[Row]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vlgs.names import file_names
-from vlgs.opened.commands import add_words, command, opened
+from vlgs.opened.commands import add_words, command, new_parser, opened
 from vlgs.values import require_choice, require_range
 
 if TYPE_CHECKING:
@@ -30,12 +30,7 @@ photographs' cameras. Written as OUT/OUTPUT/FRAME.png and OUT/OUTPUT.mp4."""
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Render; exit status 1 and one line where that cannot be."""
-    parser = argparse.ArgumentParser(
-        prog="python -m vlgs.render",
-        description=__doc__,
-        epilog=_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("vlgs.render", __doc__, _HELP)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, finished or not")
     parser.add_argument("--outputs", default="color", help="with commas between them (%(default)s)")
     parser.add_argument("--cameras", default="test", help="see below (%(default)s)")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vlgs.extras import require_extra
-from vlgs.opened.commands import add_words, command, opened
+from vlgs.opened.commands import add_words, command, new_parser, opened
 from vlgs.text import screen
 from vlgs.values import require_range
 
@@ -25,12 +25,7 @@ _POLL = 1.0
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Serve until Ctrl-C; exit status 1 and one line where that cannot be."""
-    parser = argparse.ArgumentParser(
-        prog="python -m vlgs.view",
-        description=__doc__,
-        epilog=_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser("vlgs.view", __doc__, _HELP)
     parser.add_argument(
         "runs", nargs="+", type=Path, metavar="RUN", help="folder of a run; two are compared"
     )

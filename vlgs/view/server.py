@@ -139,7 +139,7 @@ class _Panel:
             "Known words", self._known(), visible=asks, hint="asked before, or of the scene"
         )
         self.output = gui.add_dropdown("Show", outputs)
-        levels = first.level_names
+        levels = first.run.levels
         self.level = gui.add_dropdown(
             "Mask level", [_BEST, *map(str, levels)], visible=asks and len(levels) > 1
         )

@@ -102,6 +102,6 @@ def describe(runs: Sequence[Shown], wish: Wish, frame: Frame) -> list[str]:
         if answered is None:
             continue
         about = "about " if answered.approximate else ""
-        level = f", level {run.level_names[answered.level]}" if run.level_names else ""
+        level = f", level {run.run.levels[answered.level]}" if run.run.levels else ""
         lines.append(f"{wish.word}: {about}{answered.score:.3f}{level}")
     return lines

@@ -230,15 +230,9 @@ class Shown:
             self._depths = low, high
         return self._depths
 
-    @property
-    def level_names(self) -> tuple[int, ...]:
-        """Mask levels among which there is a choice, as the data number them, in the order of the field."""
-        known = [level for level in self.run.notes.levels if level is not None]
-        return tuple(known) if len(known) == len(self.levels) else ()
-
     def place(self, level: int | None) -> int | None:
         """Place of a mask level among those of the field; None where none was chosen, or the run has not this one."""
-        return None if level not in self.level_names else self.level_names.index(level)
+        return None if level not in self.run.levels else self.run.levels.index(level)
 
     def _ask(
         self, camera: Camera, kept: Kept, words: Tensor, most: int | None, stale: IsStale
