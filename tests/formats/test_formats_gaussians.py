@@ -16,8 +16,6 @@ from torch import Tensor, nn
 from vlgs.formats import (
     FORMATS,
     Imported,
-    file_digest,
-    folder_digest,
     read_gaussians,
     start_from,
     write_gaussians,
@@ -353,11 +351,6 @@ def test_a_run_starts_from_any_of_these(tmp_path: Path):
     assert start_from(tmp_path / "a.pth", attributes_of(GaussiansConfig(sh_degree=0), 8))[
         "features"
     ].shape == (2, 8)
-    before = file_digest(tmp_path / "a.pth")
-    write_ply(tmp_path / "a.pth", random_params())
-    assert file_digest(tmp_path / "a.pth") != before
-    with pytest.raises(FileNotFoundError, match="init must be a file"):
-        file_digest(tmp_path / "none.ply")
     write_ply(tmp_path / "empty.ply", random_params(0))
     with pytest.raises(ValueError, match="must hold Gaussians, got none"):
         start_from(tmp_path / "empty.ply", attributes_of(GaussiansConfig(), 3))
@@ -388,18 +381,3 @@ def test_weights_of_a_codebook_come_back_as_they_were_drawn(tmp_path: Path):
     write_ply(tmp_path / "none.ply", params | {"features": 0 * weights}, notes=(PLAIN,))
     without = start_from(tmp_path / "none.ply", attributes_of(config, 10, parts=2))["features"]
     assert not without.any(), "a file without language starts as any other"
-
-
-def test_a_folder_counts_by_what_is_in_it(tmp_path: Path):
-    for place in ("a", "b"):
-        (tmp_path / place / "deep").mkdir(parents=True)
-        (tmp_path / place / "one").write_bytes(b"1")
-        (tmp_path / place / "deep" / "two").write_bytes(b"2")
-    first = folder_digest(tmp_path / "a", "maps")
-    assert folder_digest(tmp_path / "b", "maps") == first
-    (tmp_path / "b" / "deep" / "two").write_bytes(b"3")
-    assert folder_digest(tmp_path / "b", "maps") != first
-    (tmp_path / "a" / "one").rename(tmp_path / "a" / "three")
-    assert folder_digest(tmp_path / "a", "maps") != first
-    with pytest.raises(FileNotFoundError, match="run: maps must be a folder, got"):
-        folder_digest(tmp_path / "none", "maps")
