@@ -4,14 +4,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import get_gh_backup, restore_gh_from_backup
-from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
 from vlgs.config import instantiate
@@ -26,6 +25,9 @@ from vlgs.training.build import Parts
 from vlgs.training.levels import LEVEL_OPTIONS, Levels
 from vlgs.training.stages import Method, Stages
 from vlgs.types import Scene
+
+if TYPE_CHECKING:
+    from lightning.pytorch.loggers import Logger
 
 Scenes = Mapping[int | None, Scene]
 """Mask level -> scene; the last one, of whole objects where there are several, stands for what they share."""
@@ -50,7 +52,7 @@ class Experiment:
     protocol: EvaluationProtocol | Auto
     make_text: Callable[..., TextEncoder]
     """Takes the vocabulary of the scene, as `vocabulary`."""
-    make_loggers: Callable[[], list[Logger]]
+    make_loggers: "Callable[[], list[Logger]]"
     """New ones for each model."""
     read_scene: Callable[..., Scene]
     """Takes a mask level, as `level`; by default the data's own."""
