@@ -6,8 +6,8 @@
     python -m vlgs.ablate tab=all hydra/launcher=processes hydra.launcher.n_jobs=2 threads=1
 
 Keys: `tab`; `scenes` (default: all of the data set); `seeds` (a count, or a list such as 0,4,7; default 3); `name` (folder of
-the tables below results, default the data set); `results`; `dry=true` only says what would run. Everything else goes to each
-run, or to Hydra's launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made
+the tables below results, default the data set); `results`; `dry=true` only says what would run; `warm=false` starts every run
+on this machine from nothing, where otherwise a parent does the imports once. Everything else goes to each run, or to Hydra's launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made
 it. Ctrl-C lets the runs save; the same command goes on. Exit status: 0 all tables are filled, 1 a run failed (its last lines
 and its log are shown), 130 stopped by Ctrl-C.
 """
@@ -43,7 +43,7 @@ from vlgs.tables.registry import Table, choose, load_tables
 from vlgs.tables.write import write_all
 from vlgs.text import screen, visible
 
-OWN_KEYS = ("tab", "scenes", "seeds", "name", "results", "dry")
+OWN_KEYS = ("tab", "scenes", "seeds", "name", "results", "dry", "warm")
 SCENES = {
     "synthetic": ("glassware", "mirrors", "lookalikes", "patchwork"),
     "lerf_ovs": ("ramen", "teatime", "figurines", "waldo_kitchen"),
@@ -69,6 +69,8 @@ class Request:
     launcher: tuple[str, ...]
     """Overrides of `hydra` itself."""
     dry: bool
+    warm: bool = False
+    """Whether runs on this machine come from a warm parent."""
 
 
 def main() -> None:
@@ -105,9 +107,10 @@ def read(arguments: Sequence[str]) -> Request:
             overrides.append(literal_override(argument))
     if "tab" not in own:
         raise ValueError("ablate: tab must be given, as tab=ab-multi or tab=all")
-    dry = own.get("dry", "false").lower()
-    if dry not in ("true", "false"):
-        raise ValueError(f"ablate: dry must be true or false, got {dry}")
+    switches = {"dry": own.get("dry", "false").lower(), "warm": own.get("warm", "true").lower()}
+    for key, value in switches.items():
+        if value not in ("true", "false"):
+            raise ValueError(f"ablate: {key} must be true or false, got {value}")
     given = {key: str(value) for key, value in map(_split, overrides)}
     if "seed" in given:
         raise ValueError(f"ablate: seeds must be given as seeds=, got seed={given['seed']}")
@@ -121,7 +124,8 @@ def read(arguments: Sequence[str]) -> Request:
         Benchmark(name, tuple(overrides), scenes, _seeds(own.get("seeds", "3"))),
         Path(own.get("results", "results")),
         tuple(launcher),
-        dry == "true",
+        switches["dry"] == "true",
+        switches["warm"] == "true",
     )
 
 
@@ -207,7 +211,9 @@ def _run_missing(
         numbers = range(first, first + len(missing))
         start = time.perf_counter()
         with shown(console, before, folder, numbers):
-            outcomes = launch(commands, request.results, request.launcher, folder, first)
+            outcomes = launch(
+                commands, request.results, request.launcher, folder, first, request.warm
+            )
         first += len(missing)
         if stopping.is_set():
             return

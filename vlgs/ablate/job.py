@@ -18,6 +18,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from vlgs.ablate.warm import WarmParent, WarmRun
 from vlgs.config import override_value, quote_override
 from vlgs.files import write_atomically
 from vlgs.places import without_places
@@ -81,11 +82,20 @@ def read_outcome(folder: Path, number: int) -> JobOutcome:
 
 def run_job(config: DictConfig) -> None:
     """What a Hydra launcher calls: run the overrides of this job."""
+    _run_job(warm=False)
+
+
+def run_warm_job(config: DictConfig) -> None:
+    """Likewise, on workers that are processes of this machine."""
+    _run_job(warm=True)
+
+
+def _run_job(warm: bool) -> None:
     hydra = HydraConfig.get()
-    run_and_record(Path(hydra.sweep.dir), int(hydra.job.num), list(hydra.overrides.task))
+    run_and_record(Path(hydra.sweep.dir), int(hydra.job.num), list(hydra.overrides.task), warm)
 
 
-def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
+def run_and_record(folder: Path, number: int, overrides: Sequence[str], warm: bool = False) -> None:
     """Start `python -m vlgs.run` with these overrides and wait.
 
     A run that dies, by an error, a signal or want of memory, takes nothing with it: its log stays, and the others go on.
@@ -94,11 +104,11 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
         folder: Where job and launcher talk.
         number: Of the job, unique in that folder.
         overrides: Arguments of `vlgs.run`.
+        warm: Whether to fork it from a parent that has imported all it needs (`vlgs.ablate.warm`).
     """
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / f"{number:04d}_{_title(overrides)}.log"
     arguments = [*map(_from_here, overrides), "progress=false"]
-    command = [*RUN, *arguments]
     start, stop = time.time(), folder / STOP
 
     def record(status: int | None) -> None:
@@ -111,29 +121,61 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str]) -> None:
     record(None)
     with log.open("w") as file:
         file.write(shlex.join(["python", "-m", "vlgs.run", *without_places(arguments)]) + "\n")
-        file.flush()
-        # A session of its own: Ctrl-C in a terminal reaches it once, as the SIGTERM below, and it saves its step.
-        with subprocess.Popen(
-            command,
+    run = _start_warm(arguments, log) if warm else None
+    if run is not None:
+        _wait(run, stop)
+    if (
+        run is None or not run.begun
+    ):  # there is no parent, or it could not do its imports: the log of a run says why
+        run = _start_cold(arguments, log)
+        _wait(run, stop)
+    record(run.returncode)
+
+
+_parents: list[WarmParent] = []
+"""The warm parent of this process, once a job has asked for one."""
+
+
+def leave_parent() -> None:
+    """Let the warm parent of this process end, if there is one."""
+    while _parents:
+        _parents.pop().close()
+
+
+def _start_warm(arguments: Sequence[str], log: Path) -> WarmRun | None:
+    if _parents and not _parents[0].alive:
+        leave_parent()
+    if not _parents:
+        _parents.append(WarmParent())
+    return _parents[0].start(arguments, log)
+
+
+def _start_cold(arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
+    with log.open("a") as file:
+        # A session of its own: Ctrl-C in a terminal reaches it once, as the SIGTERM of `_wait`, and it saves its step.
+        return subprocess.Popen(
+            [*RUN, *arguments],
             stdout=file,
             stderr=subprocess.STDOUT,
             env=os.environ | {"COLUMNS": "120"},
             start_new_session=True,
-        ) as process:
-            told = False
-            while process.poll() is None:
-                try:
-                    process.wait(POLL_SECONDS)
-                except subprocess.TimeoutExpired:
-                    stopping = stop.exists()
-                except KeyboardInterrupt:
-                    stopping = True
-                else:
-                    break
-                if stopping and not told:
-                    process.terminate()
-                    told = True
-    record(process.returncode)
+        )
+
+
+def _wait(run: "subprocess.Popen[bytes] | WarmRun", stop: Path) -> None:
+    """Wait for the end of a run; tell it to save when the file `stop` appears."""
+    told = False
+    while True:
+        try:
+            run.wait(POLL_SECONDS)
+            return
+        except subprocess.TimeoutExpired:
+            stopping = stop.exists()
+        except KeyboardInterrupt:
+            stopping = True
+        if stopping and not told:
+            run.terminate()
+            told = True
 
 
 def _from_here(override: str) -> str:

@@ -13,10 +13,13 @@ from hydra.core.utils import JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 
-from vlgs.ablate.job import JobOutcome, read_outcome, run_job
+from vlgs.ablate.job import JobOutcome, leave_parent, read_outcome, run_job, run_warm_job
 from vlgs.config import CONF, quote_override
 
 log = logging.getLogger(__name__)
+
+_LOCAL = ("BasicLauncher", "JoblibLauncher")
+"""Launchers whose workers are processes of this machine."""
 
 
 def launch(
@@ -25,6 +28,7 @@ def launch(
     options: Sequence[str],
     folder: Path,
     first: int,
+    warm: bool = False,
 ) -> list[JobOutcome]:
     """Run every command on the launcher; a failure is an outcome, not an exception.
 
@@ -34,6 +38,7 @@ def launch(
         options: Overrides of `hydra` itself: ``hydra/launcher=processes``, ``hydra.launcher.n_jobs=2``.
         folder: Where jobs say how they go; on a disk that every worker sees.
         first: Number of the first job; numbers are not used twice in a folder.
+        warm: Whether workers on this machine fork runs from a parent that has done their imports (`vlgs.ablate.warm`).
 
     Returns:
         One outcome per command, in their order.
@@ -57,9 +62,10 @@ def launch(
                 RunMode.MULTIRUN,
                 with_log_configuration=False,
             )
+            local = str(config.hydra.launcher._target_).endswith(_LOCAL)
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=HydraContext(hydra.config_loader, Callbacks()),
-                task_function=run_job,
+                task_function=run_warm_job if warm and local else run_job,
                 config=config,
             )
         except HydraException as error:
@@ -76,6 +82,7 @@ def launch(
             trouble = error
         finally:
             Singleton.set_state(state)
+            leave_parent()
     outcomes = [read_outcome(folder, first + index) for index in range(len(jobs))]
     said = f"{type(trouble).__name__}: {str(trouble).strip().partition(chr(10))[0]}"
     if not any(outcome.log for outcome in outcomes):
