@@ -53,11 +53,9 @@ def command() -> None:
     """The command line, from reading it to the exit status."""
     take_command_line()
     try:
-        check_command(sys.argv[1:])
+        check_command([*sys.argv[1:], "hydra/help=check"])
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
-    if {"--help", "-h"} & set(sys.argv):
-        sys.argv.append("hydra/help=check")
     main()
 
 

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Collection, Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import yaml
@@ -36,7 +37,7 @@ _REFUSED_FLAGS = {
 def check_command(arguments: Sequence[str], name: str = "config") -> None:
     """Refuse a command line with mistakes, or one that would run foreign code before the task begins.
 
-    ``--help`` with options (``data=colmap``) prints the keys of these and exits.
+    ``--help`` prints the manual, or with options (``data=colmap``) the keys of these, and exits.
 
     Args:
         arguments: Without the program.
@@ -59,11 +60,14 @@ def check_command(arguments: Sequence[str], name: str = "config") -> None:
             raise ValueError(
                 f"command: several values must be given with -m, one run for each; a list in brackets, a text in quotes, got {override.input_line}"
             )
-    if given.help and (chosen := [o for o in overrides if o.key_or_group in groups()]):
+    if given.help:
+        chosen = [o for o in overrides if o.key_or_group in groups()]
         for override in chosen:
             print(describe(override.key_or_group, str(override.value())))
+        if not chosen:
+            print(_manual(_compose(given.overrides, name, extra, hydra=True), extra, given.resolve))
         sys.exit(0)
-    if given.help or given.hydra_help or given.shell_completion:
+    if given.hydra_help or given.shell_completion:
         return
     for job in _jobs(overrides):
         config = _compose(job, name, extra, hydra=True)
@@ -83,6 +87,18 @@ def composed(overrides: Sequence[str], name: str = "config") -> DictConfig:
     config = _compose(overrides, name, None, hydra=False)
     check_targets(config, name)
     return config
+
+
+def _manual(config: DictConfig, extra: Path | None, resolve: bool) -> str:
+    """The text of ``--help``. Hydra would fill it in with the same, and copy all that it has read for every group that it lists."""
+    own = [str(key) for key in config if key != "hydra"]
+    keys = OmegaConf.to_yaml(OmegaConf.masked_copy(config, own), resolve=resolve)
+    folders = {path.parent for path in extra.rglob("*.yaml")} - {extra} if extra else set()
+    known = groups() | {folder.relative_to(extra).as_posix() for folder in folders if extra}
+    listed = [f"{group}: {', '.join(_options(group, extra))}\n" for group in sorted(known)]
+    return Template(config.hydra.help.template).substitute(
+        APP_CONFIG_GROUPS="".join(listed), CONFIG=keys
+    )
 
 
 def _parse(overrides: Sequence[str]) -> list[Override]:

@@ -182,6 +182,8 @@ def _serve(say: int) -> list[str] | None:
             os.write(say, f"{status}\n".encode())
         except BrokenPipeError:
             return None
+    if unburied:
+        os.waitpid(unburied, 0)
     return None
 
 

@@ -239,6 +239,21 @@ def protocols(parser: ArgumentParser) -> Runner:
     return run
 
 
+def startup(parser: ArgumentParser) -> Runner:
+    """What a run costs beside its training, part by part; a small sweep from a warm parent and without one."""
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--no-sweep", action="store_true", help="single runs alone")
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.startup import run_startup
+
+        repeats = 1 if args.quick else args.repeats
+        run_startup(args.quick, repeats, not args.no_sweep, args.out, args.seed)
+        return 0
+
+    return run
+
+
 SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     kernel,
     error,
@@ -251,6 +266,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     iteration,
     reading,
     protocols,
+    startup,
 )
 """Name, help and options of a subcommand are those of its function; `all` runs them in this order."""
 

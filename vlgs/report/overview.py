@@ -32,6 +32,8 @@ TILE, GAP, MARGIN = 2.2, 0.06, 0.3
 FOOT = 1.05
 """Height of the legend, the scales and the histogram, inches."""
 DPI = 200
+PNG_LEVEL = 1
+"""Effort of compression: the files are a fifth larger than at Pillow's own 6 and are written in a quarter of the time."""
 PHOTOGRAPH, RENDER, FEATURES = "photograph", "render", "language features"
 LABELS, PREDICTION = "true classes", "predicted classes"
 BEST = "best of the words asked"
@@ -86,7 +88,8 @@ def write_overview(
 
 def _save(figure: "Figure", path: Path) -> None:
     stream = io.BytesIO()
-    figure.savefig(stream, format=path.suffix[1:], dpi=DPI)
+    png = {"pil_kwargs": {"compress_level": PNG_LEVEL}} if path.suffix == ".png" else {}
+    figure.savefig(stream, format=path.suffix[1:], dpi=DPI, **png)
     write_atomically(path, stream.getvalue(), durable=False)
 
 

@@ -14,7 +14,7 @@ from vlgs.files import write_atomically
 from vlgs.names import file_names
 from vlgs.query import Prompts, Query
 from vlgs.report.draw import Painter, ViewPictures
-from vlgs.report.overview import count_difference, write_histogram, write_overview
+from vlgs.report.overview import PNG_LEVEL, count_difference, write_histogram, write_overview
 from vlgs.types import Scene
 
 T = TypeVar("T")
@@ -122,5 +122,5 @@ def save_picture(path: Path, picture: UInt8[Tensor, "h w 3"]) -> None:
     )  # pycolmap must not be imported before it; whoever needs pycolmap sees to that
 
     stream = io.BytesIO()
-    Image.fromarray(picture.numpy()).save(stream, format="png")
+    Image.fromarray(picture.numpy()).save(stream, format="png", compress_level=PNG_LEVEL)
     write_atomically(path, stream.getvalue(), durable=False)

@@ -33,8 +33,8 @@ def measure_fps(
     query: Query,
     prompts: Prompts | None,
     language: bool = True,
-    seconds: float = 5.0,
-    repeats: int = 100,
+    seconds: float = 3.0,
+    repeats: int = 30,
 ) -> Timing:
     """Time renders and queries; warm-up is left out, and cameras take turns.
 

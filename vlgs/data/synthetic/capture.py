@@ -3,6 +3,7 @@
 import functools
 import io
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from jaxtyping import Int
 
 from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
 from vlgs.data.synthetic.layouts import build
-from vlgs.data.synthetic.masks import NO_NOISE, Region
+from vlgs.data.synthetic.masks import LEVELS, NO_NOISE, Region
 from vlgs.data.synthetic.photographs import TracedImage, photograph
 from vlgs.data.synthetic.settings import SceneSettings
 from vlgs.data.synthetic.world import World
@@ -123,9 +124,9 @@ def _photographs(
 
 
 def regions(
-    world: World, photo: TracedImage
+    world: World, photo: TracedImage, levels: Collection[int] = LEVELS
 ) -> tuple[dict[int, Int[np.ndarray, "h w"]], dict[int, dict[int, Region]]]:
-    """Region number per pixel, and what the regions are, at levels 1 (subpart), 2 (part) and 3 (whole)."""
+    """Region number per pixel at levels 1 (subpart), 2 (part) and 3 (whole), and what the regions of the wanted `levels` are."""
     part = photo.part.astype(np.int64)
     numbers = {3: world.thing_of_part[part], 2: part, 1: part * _PATCHES + photo.patch}
     findable = np.array([thing.masked for thing in world.things])[numbers[3]]
@@ -139,7 +140,7 @@ def regions(
         return Region(word, f"{word}, part {place[part]}, patch {patch}")
 
     names = {
-        level: {n: region(level, n) for n in np.unique(found[findable]).tolist()}
-        for level, found in numbers.items()
+        level: {n: region(level, n) for n in np.unique(numbers[level][findable]).tolist()}
+        for level in levels
     }
     return numbers, names

@@ -97,7 +97,7 @@ def view_masks(
     faults: LabelNoise,
     key: tuple[int, ...],
 ) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
-    """Supervision of one view at levels 0, 1, 2 and 3.
+    """Supervision of one view at levels 0, 1, 2 and 3; `level_masks` makes one of them alone.
 
     Args:
         regions: Level in 1 to 3 -> exact region number per pixel.
@@ -106,13 +106,9 @@ def view_masks(
         faults: Resolved rates.
         key: Seed, scene and number of the view: what the draws are functions of, besides the mask.
     """
-    levels = {
-        level: _level_masks(
-            regions[level], regions[_WHOLE], names[level], words, faults, (*key, level)
-        )
-        for level in LEVELS
-    }
-    whole, part, subpart = levels[3], levels[2], levels[1]
+    subpart, part, whole = (
+        level_masks(regions, names, words, faults, key, level) for level in LEVELS
+    )
     index, offset = whole.index, whole.vectors.shape[0]
     for level, finer in ((2, part), (1, subpart)):
         rng = np.random.default_rng([_LAYING, *key, level])
@@ -124,6 +120,21 @@ def view_masks(
     first = int(rows[0] < 0)
     default = LevelMasks((compact.reshape(index.shape) - first).astype(np.int32), vectors)
     return default, subpart, part, whole
+
+
+def level_masks(
+    regions: Mapping[int, Int[np.ndarray, "h w"]],
+    names: Mapping[int, Mapping[int, Region]],
+    words: tuple[str, ...],
+    faults: LabelNoise,
+    key: tuple[int, ...],
+    level: int,
+) -> LevelMasks:
+    """Supervision of one view at one level of 0 to 3, see `view_masks`; regions of the levels 1 and 2 are needed for these and for 0 alone."""
+    if level == 0:
+        return view_masks(regions, names, words, faults, key)[0]
+    own, wholes = regions[level], regions[_WHOLE]
+    return _level_masks(own, wholes, names[level], words, faults, (*key, level))
 
 
 def _level_masks(

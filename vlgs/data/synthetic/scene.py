@@ -12,7 +12,7 @@ from torch import Tensor
 from vlgs.data.synthetic.capture import Capture, Shot, open_capture, regions
 from vlgs.data.synthetic.labels import dense_labels, object_labels
 from vlgs.data.synthetic.language import vocabulary
-from vlgs.data.synthetic.masks import LabelNoise, LevelMasks, view_masks
+from vlgs.data.synthetic.masks import LEVELS, LabelNoise, LevelMasks, level_masks, view_masks
 from vlgs.data.synthetic.photographs import TracedImage, photograph
 from vlgs.data.synthetic.points import view_points
 from vlgs.data.synthetic.scene_file import find_scene
@@ -66,9 +66,9 @@ def load_scene(
     folder = None if cache is None else Path(cache)
     capture = open_capture(settings, folder)
     indices, vectors, offset = {}, [], 0
-    for name, levels in language_levels(settings, folder).items():
-        masks = levels[level]
-        indices[name] = np.where(masks.index >= 0, masks.index + offset, -1).astype(np.int32)
+    for shot in capture.train:
+        masks = _masks(settings, capture, shot.photo, shot.number, level)
+        indices[shot.name] = np.where(masks.index >= 0, masks.index + offset, -1).astype(np.int32)
         vectors.append(masks.vectors)
         offset += masks.vectors.shape[0]
     areas = np.zeros(offset)
@@ -101,7 +101,13 @@ def language_levels(
     """Supervision of every training view at levels 0 to 3, by view name; what `write_scene` puts on disk."""
     capture = open_capture(settings, cache)
     return {
-        shot.name: _levels(settings, capture, shot.photo, shot.number) for shot in capture.train
+        shot.name: view_masks(
+            *regions(capture.world, shot.photo),
+            capture.classes,
+            settings.faults.resolve(settings.difficulty),
+            _key(settings, shot.number),
+        )
+        for shot in capture.train
     }
 
 
@@ -114,20 +120,22 @@ def _supervise(
     """
     capture = open_capture(settings, cache)
     photo = photograph(capture.world, camera)
-    masks = _levels(settings, capture, photo, MAX_VIEWS + 1 + number)[level]
+    masks = _masks(settings, capture, photo, MAX_VIEWS + 1 + number, level)
     return torch.from_numpy(masks.index.astype(np.int32)), torch.from_numpy(masks.vectors)
 
 
-def _levels(
-    settings: SceneSettings, capture: Capture, photo: TracedImage, number: int
-) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
+def _masks(
+    settings: SceneSettings, capture: Capture, photo: TracedImage, number: int, level: int
+) -> LevelMasks:
     faults = settings.faults.resolve(settings.difficulty)
-    key = (
-        settings.seed,
-        zlib.crc32(f"{settings.scene.key} {settings.difficulty}".encode()),
-        number,
-    )
-    return view_masks(*regions(capture.world, photo), capture.classes, faults, key)
+    found = regions(capture.world, photo, (level,) if level else LEVELS)
+    return level_masks(*found, capture.classes, faults, _key(settings, number), level)
+
+
+def _key(settings: SceneSettings, number: int) -> tuple[int, ...]:
+    """What the faults of a view are drawn by."""
+    place = zlib.crc32(f"{settings.scene.key} {settings.difficulty}".encode())
+    return settings.seed, place, number
 
 
 def _view(capture: Capture, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:

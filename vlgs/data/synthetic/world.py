@@ -1,5 +1,6 @@
 """Intersection of rays with all things of a scene: the first hit, its colour and normal, and how much light of the lamp arrives there."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,10 +62,10 @@ class World:
         self._bound_centers = np.concatenate(self._centers, axis=1).T + axes * heights[:, None]
         # Which rays come near is decided in float32 with a millimetre to spare.
         self._bound_radii2 = np.array([[(radius + 1e-3) ** 2] for _, radius in bounds], np.float32)
-        self.shades = self._shades()
 
-    def _shades(self) -> dict[int, Shade]:
-        """Shadows of what stands on the table on its top, and of the table on the floor, by part number."""
+    @functools.cached_property
+    def shades(self) -> dict[int, Shade]:
+        """Shadows of what stands on the table on its top, and of the table on the floor, by part number; cast when the first ray asks."""
         names = np.array([self.things[thing].name for thing in self.thing_of_part])
         table, floor = (
             np.flatnonzero(names == "wooden table"),
