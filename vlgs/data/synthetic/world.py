@@ -13,6 +13,8 @@ from vlgs.data.synthetic.shapes import Vectors
 NOTHING = 255
 """Part number of a ray that hits nothing; does not happen from inside the room."""
 
+_NEAR_BLOCK = 2048
+"""Rays whose distances to all parts stay in the cache."""
 _SHADOW_RAYS = 24
 _SHADOW_CELLS = 192
 _LAMP_RADIUS = 0.26
@@ -100,17 +102,24 @@ class World:
         self, origin: Vectors, direction: Float[np.ndarray, "3 n"]
     ) -> Bool[np.ndarray, "parts n"]:
         """Which rays pass through the bounding sphere of which part."""
-        if origin.shape[1] == 1:
-            offset = self._bound_centers - origin.T
-            distance2 = (offset * offset).sum(1, keepdims=True).astype(np.float32)
-            along = apply(offset.astype(np.float32), direction.astype(np.float32))
-        else:
-            start, centers = origin.astype(np.float32), self._bound_centers.astype(np.float32)
-            distance2 = apply(-2 * centers, start)
-            distance2 += (centers * centers).sum(1, keepdims=True) + (start * start).sum(0)
-            along = apply(centers, direction.astype(np.float32))
-            along -= (origin * direction).sum(0).astype(np.float32)
-        return along * along >= distance2 - self._bound_radii2
+        count = direction.shape[1]
+        near = np.empty((len(self.parts), count), bool)
+        offset = self._bound_centers - origin.T if origin.shape[1] == 1 else None
+        for first in range(0, count, _NEAR_BLOCK):
+            rays = slice(first, first + _NEAR_BLOCK)
+            towards = direction[:, rays]
+            if offset is not None:
+                distance2 = (offset * offset).sum(1, keepdims=True).astype(np.float32)
+                along = apply(offset.astype(np.float32), towards.astype(np.float32))
+            else:
+                own, centers = origin[:, rays], self._bound_centers.astype(np.float32)
+                start = own.astype(np.float32)
+                distance2 = apply(-2 * centers, start)
+                distance2 += (centers * centers).sum(1, keepdims=True) + (start * start).sum(0)
+                along = apply(centers, towards.astype(np.float32))
+                along -= (own * towards).sum(0).astype(np.float32)
+            np.greater_equal(along * along, distance2 - self._bound_radii2, out=near[:, rays])
+        return near
 
     def _intersect(
         self,
