@@ -58,9 +58,13 @@ def object_labels(
         mask = np.zeros(ids.shape, bool)
         found = []
         for thing in np.unique(things[ids == class_id]):
-            pieces = components((things == thing) & (ids == class_id))
+            own = (things == thing) & (ids == class_id)
+            y, x = np.nonzero(own)
+            top, left = y.min(), x.min()
+            pieces = components(own[top : y.max() + 1, left : x.max() + 1])
             for number in range(1, int(pieces.max()) + 1):
                 y, x = np.nonzero(pieces == number)
+                y, x = y + top, x + left
                 if y.size >= smallest:
                     mask[y, x] = True
                     found.append([x.min(), y.min(), x.max(), y.max()])
