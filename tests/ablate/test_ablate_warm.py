@@ -149,7 +149,9 @@ def test_a_warm_run_has_the_bits_of_a_cold_one(tmp_path: Path):
     parent = WarmParent()
     for seed in (0, 1):  # the second is not the first child
         place = [f"results={tmp_path / 'warm'}", f"seed={seed}"]
-        assert ended(parent.start([*arguments, *place], log), 600.0).returncode == 0, log.read_text()
+        assert ended(parent.start([*arguments, *place], log), 600.0).returncode == 0, (
+            log.read_text()
+        )
     parent.close()
     cold = [sys.executable, "-m", "vlgs.run", *arguments, f"results={tmp_path / 'cold'}", "seed=1"]
     subprocess.run(cold, check=True, capture_output=True)
