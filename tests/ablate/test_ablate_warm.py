@@ -118,8 +118,7 @@ def test_the_parent_has_one_thread_and_a_child_as_many_as_it_asks_for(
     assert {digest for _, digest in found} == {cold.read_text().split()[1]}
 
 
-def test_the_parent_ends_with_whoever_started_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(warm, "SHARED", ())
+def test_the_parent_ends_with_whoever_started_it():
     code = (
         "from vlgs.ablate import warm; import os, signal\n"
         "warm.SHARED = ()\nprint(warm.WarmParent().pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)"

@@ -124,9 +124,8 @@ def run_and_record(folder: Path, number: int, overrides: Sequence[str], warm: bo
     run = _start_warm(arguments, log) if warm else None
     if run is not None:
         _wait(run, stop)
-    if (
-        run is None or not run.begun
-    ):  # there is no parent, or it could not do its imports: the log of a run says why
+    if run is None or not run.begun:
+        # Without a parent, or with one whose imports failed: the log says why, or all is well.
         run = _start_cold(arguments, log)
         _wait(run, stop)
     record(run.returncode)

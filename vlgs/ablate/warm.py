@@ -59,7 +59,7 @@ class WarmRun:
                 self._child = int(line)
                 if self._told:
                     self.terminate()
-            elif line:
+            else:
                 self.returncode = int(line)
                 return
         if self._parent.alive:
