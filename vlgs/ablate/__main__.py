@@ -8,8 +8,9 @@
 Keys: `tab`; `scenes` (default: all of the data set); `seeds` (a count, or a list such as 0,4,7; default 3); `name` (folder of
 the tables below results, default the data set); `results`; `dry=true` only says what would run; `warm=false` starts every run
 on this machine from nothing, where otherwise a parent does the imports once. Everything else goes to each run, or to Hydra's
-launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made it. Ctrl-C lets the runs save; the same command goes on. Exit status: 0 all tables are filled, 1 a run failed (its last lines
-and its log are shown), 130 stopped by Ctrl-C.
+launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made it.
+Ctrl-C lets the runs save; the same command goes on. Exit status: 0 all tables are filled, 1 a run failed (its last lines and
+its log are shown), 130 stopped by Ctrl-C.
 """
 
 import os

@@ -113,13 +113,13 @@ class WarmParent:
 
     def hear(self, until: float) -> str | None:
         """The next line of an answer; None where none came in time, or the parent is dead."""
-        assert self._process.stdout is not None
+        answers = self._process.stdout
+        assert answers is not None
         while b"\n" not in self._heard:
-            if not select.select([self._process.stdout], [], [], max(0, until - time.monotonic()))[
-                0
-            ]:
+            ready, _, _ = select.select([answers], [], [], max(0, until - time.monotonic()))
+            if not ready:
                 return None
-            chunk = os.read(self._process.stdout.fileno(), 4096)
+            chunk = os.read(answers.fileno(), 4096)
             if not chunk:
                 self.alive = False
                 return None
