@@ -151,6 +151,26 @@ def unseen(parser: ArgumentParser) -> Runner:
     return run
 
 
+def threads(parser: ArgumentParser) -> Runner:
+    """The rasterizer by which of torch and vlgs is imported first, idle and beside busy processes."""
+    parser.add_argument(
+        "--size", type=int, nargs=3, default=(10_000, 320, 240), metavar=("N", "W", "H")
+    )
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=40)
+
+    def run(args: Namespace) -> int:
+        from rich.console import Console
+
+        from vlgs.bench.threads import measure_threads, show_threads
+
+        size, repeats = ((500, 64, 48), 2) if args.quick else (args.size, args.repeats)
+        Console().print(show_threads(measure_threads(*size, args.threads, repeats)))
+        return 0
+
+    return run
+
+
 def overhead(parser: ArgumentParser) -> Runner:
     """What the Trainer adds to an iteration."""
     parser.add_argument("--iterations", type=int, default=300)
@@ -246,6 +266,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     growth,
     train,
     unseen,
+    threads,
     overhead,
     seams,
     iteration,
