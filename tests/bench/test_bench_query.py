@@ -38,7 +38,7 @@ def test_every_way_has_its_time_and_its_error(tmp_path: Path):
     alone = asked.field.similarity(camera, prompts.text)[0, 0]
     torch.testing.assert_close(alone, cosine, rtol=0, atol=1e-6)
     smoothed = ask_view(asked.field, camera, asked.questions).relevancy[0, 0]
-    assert relevancy.mean() == pytest.approx(smoothed.mean(), abs=0.05)
+    assert float(relevancy.mean()) == pytest.approx(float(smoothed.mean()), abs=0.05)
 
     trained.module.model.head = Linear(128)
     with pytest.raises(ValueError, match="codes of 3 numbers and a head that folds, got 128"):

@@ -244,8 +244,8 @@ def query(parser: ArgumentParser) -> Runner:
     parser.add_argument(
         "--run", type=Path, help="a run folder; default: train the procedural scene"
     )
-    parser.add_argument("--threads", type=int, nargs="+", default=[2])
-    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=5)
 
     def run(args: Namespace) -> int:
         from vlgs.bench.presets import load_run, train_a_little, train_or_load

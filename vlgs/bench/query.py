@@ -36,7 +36,7 @@ from vlgs.query import Questions, encode_prompts
 from vlgs.report.pictures import spread as evenly
 from vlgs.types import Camera, RasterConfig
 
-VIEWS = 8
+VIEWS = 4
 """Cameras that take turns."""
 OBJECTS = 40
 """Of the workload, whose Gaussians have the code of the nearest object and some noise."""
