@@ -13,7 +13,7 @@ from torch import Tensor
 from vlgs.bench.clock import Spread, spread, take_turns
 from vlgs.bench.pareto import front
 from vlgs.bench.presets import Trained
-from vlgs.bench.record import (  # fmt: skip
+from vlgs.bench.record import (
     COLORS,
     STYLE,
     plain_ticks,
@@ -24,6 +24,7 @@ from vlgs.bench.record import (  # fmt: skip
     write_record,
 )
 from vlgs.bench.workload import make_workload
+from vlgs.fields import FieldImages
 from vlgs.fields.comparing import CELLS, Decoding, Folding, Tabulating
 from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
@@ -227,7 +228,7 @@ def answer(asked: Asked, field: SplatField, camera: Camera) -> Float[Tensor, "bo
     return torch.cat([relevancy, found[:1]])
 
 
-def _look(field: SplatField, camera: Camera):
+def _look(field: SplatField, camera: Camera) -> FieldImages:
     return field.render(camera, frozenset({"color", "feature"}))
 
 
@@ -237,7 +238,8 @@ def _first_looks(
     """Milliseconds of the first answer of each way, and how far all answers are from the first way's: cosines, relevancy, and 99.9 % of it."""
     firsts: dict[str, tuple[float, float]] = {}
     off: dict[str, list[Tensor]] = {name: [] for name in fields}
-    answer(asked, asked.field, asked.cameras[0])  # what is fused once is not of any way
+    for field in fields.values():
+        _look(field, asked.cameras[0])  # Gaussians are fused once, for whatever is asked
     for camera in asked.cameras:
         exact: Tensor | None = None
         for name, field in fields.items():
