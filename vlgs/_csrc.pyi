@@ -192,6 +192,16 @@ def squared_error_backward(
     d_a: Tensor,
     threads: int,
 ) -> None: ...
+def code_table(
+    codes: Tensor,
+    low: float,
+    per_unit: float,
+    places: Tensor,
+    rows: Tensor,
+    out: Tensor,
+    threads: int,
+) -> int:
+    """How many codes lack a node."""
 
 class CachedWeightsFloat:
     def __init__(self, picture: RasterizedFloat, threads: int) -> None: ...

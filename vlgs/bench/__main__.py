@@ -259,6 +259,32 @@ def protocols(parser: ArgumentParser) -> Runner:
     return run
 
 
+def query(parser: ArgumentParser) -> Runner:
+    """An answer to a word beside its two renders: decoded, folded, tables of several sizes, and their errors."""
+    parser.add_argument(
+        "--run", type=Path, help="a run folder; default: train the procedural scene"
+    )
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=5)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.presets import load_run, train_a_little, train_or_load
+        from vlgs.bench.query import LARGE, run_query
+        from vlgs.bench.train import QUICK
+
+        if args.run is not None:
+            trained = load_run(args.run)
+        elif args.quick:
+            trained = train_a_little([*QUICK, "head.cache_dir=null", f"seed={args.seed}"])
+        else:
+            trained = train_or_load([f"seed={args.seed}"], Path("results"))
+        large, repeats = ((300, 40, 30), 2) if args.quick else (LARGE, args.repeats)
+        run_query(trained, large, args.threads, repeats, args.out, args.seed)
+        return 0
+
+    return run
+
+
 SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     kernel,
     error,
@@ -272,6 +298,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     iteration,
     reading,
     protocols,
+    query,
 )
 """Name, help and options of a subcommand are those of its function; `all` runs them in this order."""
 
