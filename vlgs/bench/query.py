@@ -218,14 +218,15 @@ def measure(asked: Asked, repeats: int) -> list[Row]:
 
 
 @torch.no_grad()
-def answer(asked: Asked, field: SplatField, camera: Camera) -> Float[Tensor, "both h w"]:
+def answer(
+    asked: Asked, field: SplatField, camera: Camera
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """The relevancy of the word and its cosine, of a view that is rendered for it."""
     prompts = asked.questions.prompts
     found = field.similarity(
         camera, torch.cat([prompts.text, prompts.negatives]), _look(field, camera)
     )[0]
-    relevancy = asked.questions.query.relevancy(found[:1], found[1:])
-    return torch.cat([relevancy, found[:1]])
+    return asked.questions.query.relevancy(found[:1], found[1:])[0], found[0]
 
 
 def _look(field: SplatField, camera: Camera) -> FieldImages:
@@ -241,14 +242,15 @@ def _first_looks(
     for field in fields.values():
         _look(field, asked.cameras[0])  # Gaussians are fused once, for whatever is asked
     for camera in asked.cameras:
-        exact: Tensor | None = None
+        exact: Sequence[Tensor] | None = None
         for name, field in fields.items():
             wall, cpu = time.perf_counter(), time.process_time()
             found = answer(asked, field, camera)
             took = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
             firsts.setdefault(name, took)
             exact = found if exact is None else exact
-            off[name].append((found - exact).abs().flatten(1))
+            gaps = [(a - b).abs().flatten() for a, b in zip(found, exact, strict=True)]
+            off[name].append(torch.stack(gaps))
     return firsts, {name: _errors(torch.cat(parts, dim=1)) for name, parts in off.items()}
 
 
