@@ -1,7 +1,5 @@
 // Attention over all Gaussians: chunks of fixed size, whatever the number of threads, and sums over chunks in
 // their order.
-#include <omp.h>
-
 #include <algorithm>
 
 #include "buffer_pool.h"
@@ -22,12 +20,11 @@ void attention(const Attention<T> &a, int64_t n, Fused<T *> out, int threads) {
   const int64_t chunks = (n + kGaussiansAtOnce - 1) / kGaussiansAtOnce;
   const int64_t size = kernels<T>().attention_scratch(a.shape);
   const Buffer<T> scratch(threads * size);
-#pragma omp parallel for num_threads(threads)
-  for (int64_t c = 0; c < chunks; ++c) {
+  for_each_in_turn(chunks, threads, 1, [&](int64_t c, int thread) {
     const int64_t begin = c * kGaussiansAtOnce;
     kernels<T>().attention(a, out, begin, std::min(n, begin + kGaussiansAtOnce),
-                           scratch.data() + omp_get_thread_num() * size);
-  }
+                           scratch.data() + thread * size);
+  });
 }
 
 template <class T>
@@ -41,9 +38,8 @@ void attention_backward(const Attention<T> &a, int64_t n, Fused<const T *> d_out
   int64_t total = 0;
   for (int i = 0; i < Layers::kCount; ++i) total += counts[i];
   const Buffer<T> scratch(threads * size), lanes(threads * total * kLanes), sums(chunks * total);
-#pragma omp parallel for num_threads(threads)
-  for (int64_t c = 0; c < chunks; ++c) {
-    const int64_t begin = c * kGaussiansAtOnce, thread = omp_get_thread_num();
+  for_each_in_turn(chunks, threads, 1, [&](int64_t c, int thread) {
+    const int64_t begin = c * kGaussiansAtOnce;
     T *mine = lanes.data() + thread * total * kLanes;
     std::fill_n(mine, total * kLanes, T(0));
     Layers at;
@@ -56,7 +52,7 @@ void attention_backward(const Attention<T> &a, int64_t n, Fused<const T *> d_out
       for (int64_t l = 0; l < kLanes; ++l) sum += mine[k * kLanes + l];
       sums[c * total + k] = sum;
     }
-  }
+  });
   int64_t first = 0;
   for (int i = 0; i < Layers::kCount; first += counts[i++])
     for (int64_t k = 0; k < counts[i]; ++k) {

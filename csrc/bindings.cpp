@@ -1,6 +1,7 @@
 // The module that Python sees: one file of bindings per operation, and which machine runs them.
 #include "bindings.h"
 
+#include "freed_memory.h"
 #include "kernels.h"
 
 namespace vlgs {
@@ -27,6 +28,7 @@ NB_MODULE(_csrc, m) {
   m.def("isa", &isa);
   m.def("isas", &isas);
   m.def("peak_fma", &peak_fma, "packs"_a);
+  m.def("keep_freed_memory", &keep_freed_memory, "on"_a);
   bind_project(m);
   bind_rasterize(m);
   bind_attention(m);
@@ -34,4 +36,5 @@ NB_MODULE(_csrc, m) {
   bind_ssim(m);
   bind_squared_error(m);
   bind_cached_weights(m);
+  bind_code_table(m);
 }

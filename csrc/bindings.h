@@ -33,5 +33,6 @@ void bind_view_color(nb::module_ &m);
 void bind_ssim(nb::module_ &m);
 void bind_squared_error(nb::module_ &m);
 void bind_cached_weights(nb::module_ &m);
+void bind_code_table(nb::module_ &m);
 
 }  // namespace vlgs

@@ -40,22 +40,20 @@ void sort_by_depth(Buffer<Candidate<T>> &items, int64_t count, int threads) {
   std::vector<int64_t> places(size_t(threads) * kDigits);
   for (int shift = 0; shift < int(sizeof(T)) * 8; shift += kBits) {
     const auto digit = [shift](const Candidate<T> &c) { return int(c.depth >> shift) & (kDigits - 1); };
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-    for (int t = 0; t < threads; ++t) {
+    for_shares(threads, [&](int t) {
       int64_t *mine = places.data() + size_t(t) * kDigits;
       std::fill(mine, mine + kDigits, 0);
       const Range r = share(count, t, threads);
       for (int64_t i = r.begin; i < r.end; ++i) ++mine[digit(items[i])];
-    }
+    });
     int64_t place = 0;
     for (int d = 0; d < kDigits; ++d)
       for (int t = 0; t < threads; ++t) place += std::exchange(places[size_t(t) * kDigits + d], place);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-    for (int t = 0; t < threads; ++t) {
+    for_shares(threads, [&](int t) {
       int64_t *mine = places.data() + size_t(t) * kDigits;
       const Range r = share(count, t, threads);
       for (int64_t i = r.begin; i < r.end; ++i) other[mine[digit(items[i])]++] = items[i];
-    }
+    });
     std::swap(items, other);
   }
 }
@@ -106,8 +104,7 @@ DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
   DepthOrder<T> order{0, {}, Buffer<uint32_t>(n), Buffer<T>(chains * n), Buffer<Box>(n)};
   Buffer<Candidate<T>> candidates(n);
   std::vector<int64_t> kept(threads);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) {
+  for_shares(threads, [&](int t) {
     const Range r = share(n, t, threads);
     int64_t count = 0;
     for (int64_t first = r.begin; first < r.end; first += kRowsAtOnce) {
@@ -130,7 +127,7 @@ DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
       }
     }
     kept[t] = count;
-  }
+  });
   for (int t = 0; t < threads; ++t) {
     const Candidate<T> *from = candidates.data() + share(n, t, threads).begin;
     std::copy(from, from + kept[t], candidates.data() + order.count);
@@ -138,11 +135,10 @@ DepthOrder<T> sort_visible(const Grid &grid, int64_t n, const Splats<T> &splats,
   }
   sort_by_depth<T>(candidates, order.count, threads);
   order.ids = Buffer<uint32_t>(order.count);
-#pragma omp parallel for num_threads(threads)
-  for (int64_t rank = 0; rank < order.count; ++rank) {
+  for_each(order.count, threads, [&](int64_t rank) {
     order.ids[rank] = candidates[rank].id;
     order.rank_of[candidates[rank].id] = uint32_t(rank);
-  }
+  });
   return order;
 }
 
@@ -155,8 +151,7 @@ TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order,
   const T full = std::log2(1 / alpha_min);  // the cutoff of a weight of 1
   Buffer<Extent<T>> extents(m);
   Buffer<int64_t> first(m + 1);  // of the masks of each rank
-#pragma omp parallel for num_threads(threads)
-  for (int64_t rank = 0; rank < m; ++rank) {
+  for_each(m, threads, [&](int64_t rank) {
     const T *g = records + rank * kRecord;
     const uint32_t id = order.ids[rank];
     if (trim.opacity_extent)
@@ -164,7 +159,7 @@ TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order,
     else
       extents[rank] = {box_of(grid, g, full), full};
     first[rank + 1] = extents[rank].tiles();
-  }
+  });
   first[0] = 0;
   for (int64_t rank = 0; rank < m; ++rank) first[rank + 1] += first[rank];
   check_budget(first[m], sizeof(uint16_t), budget);
@@ -172,8 +167,7 @@ TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order,
   // Masks over the boxes, and for every thread how many of each tile are not empty.
   Buffer<uint16_t> masks(first[m]);
   std::vector<int64_t> places(size_t(threads) * tiles);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) {
+  for_shares(threads, [&](int t) {
     int64_t *mine = places.data() + size_t(t) * tiles;
     const Range r = share(m, t, threads);
     for (int64_t rank = r.begin; rank < r.end; ++rank) {
@@ -191,7 +185,7 @@ TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order,
         reaches = reaches_any(grid, records + rank * kRecord, widest(order, n, chains, order.ids[rank]));
       visible[order.ids[rank]] = reaches;
     }
-  }
+  });
 
   // Within a tile one thread's entries follow the other's, which keeps the order of depth.
   TileLists lists;
@@ -211,8 +205,7 @@ TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order,
 
   lists.ranks = Buffer<uint32_t>(total);
   lists.masks = Buffer<uint16_t>(total);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) {
+  for_shares(threads, [&](int t) {
     int64_t *mine = places.data() + size_t(t) * tiles;
     const Range r = share(m, t, threads);
     for (int64_t rank = r.begin; rank < r.end; ++rank) {
@@ -226,7 +219,7 @@ TileLists bin_gaussians(const Grid &grid, int64_t n, const DepthOrder<T> &order,
             lists.masks[place] = *mask;
           }
     }
-  }
+  });
   return lists;
 }
 

@@ -1,7 +1,5 @@
 #include "cached_weights.h"
 
-#include <omp.h>
-
 #include <algorithm>
 #include <limits>
 #include <stdexcept>
@@ -9,17 +7,23 @@
 #include <utility>
 
 #include "checks.h"
+#include "threads.h"
 
 namespace vlgs {
+namespace {
+
+constexpr int64_t kRowsAtOnce = 64;
+
+}  // namespace
 
 template <class T>
 CachedWeights<T>::CachedWeights(const Rasterized<T> &picture, int threads)
     : n_(picture.rows()), grid_(picture.pass().grid), row_begin_(size_t(n_) + 1) {
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y;
   block_begin_.assign(size_t(tiles) * kBlocks + 1, 0);
-#pragma omp parallel for num_threads(threads) schedule(dynamic)
-  for (int64_t tile = 0; tile < tiles; ++tile)
+  for_each_in_turn(tiles, threads, 1, [&](int64_t tile, int) {
     kernels<T>().cache_weights(picture.pass(), tile, block_begin_.data() + tile * kBlocks, nullptr, nullptr);
+  });
   int64_t entries = 0;
   for (int64_t &count : block_begin_) entries += std::exchange(count, entries);
   if (std::max(entries, tiles * kBlocks) > int64_t(std::numeric_limits<uint32_t>::max()))
@@ -32,13 +36,12 @@ void CachedWeights<T>::keep(const Rasterized<T> &picture, int threads) {
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y, entries = block_begin_.back();
   ids_ = Buffer<uint32_t>(entries);
   weights_ = Buffer<T>(entries * kPixels);
-#pragma omp parallel for num_threads(threads) schedule(dynamic)
-  for (int64_t tile = 0; tile < tiles; ++tile) {
+  for_each_in_turn(tiles, threads, 1, [&](int64_t tile, int) {
     int64_t counts[kBlocks];
     const int64_t *begin = block_begin_.data() + tile * kBlocks;
     kernels<T>().cache_weights(picture.pass(), tile, counts, ids_.data() + begin[0],
                                weights_.data() + begin[0] * kPixels);
-  }
+  });
   index_by_gaussian();
   kept_ = true;
 }
@@ -73,13 +76,12 @@ void CachedWeights<T>::render(const T *values, int64_t channels, T *image, int t
   const Kernels<T> &kernel = kernels<T>();
   const int64_t blocks = int64_t(block_begin_.size()) - 1;
   const Buffer<T> scratch(threads * channels * kPixels);
-#pragma omp parallel for num_threads(threads) schedule(dynamic, kBlocks)
-  for (int64_t block = 0; block < blocks; ++block) {
+  for_each_in_turn(blocks, threads, kBlocks, [&](int64_t block, int thread) {
     const int64_t begin = block_begin_[block];
     kernel.cached_weights_render(grid_, block, block_begin_[block + 1] - begin, ids_.data() + begin,
                                  weights_.data() + begin * kPixels, values, channels,
-                                 scratch.data() + omp_get_thread_num() * channels * kPixels, image);
-  }
+                                 scratch.data() + thread * channels * kPixels, image);
+  });
 }
 
 // By Gaussian, each by one thread and over its blocks in order, so that the bits do not depend on the
@@ -91,16 +93,15 @@ void CachedWeights<T>::backward(const T *d_image, int64_t channels, T *d_values,
     check_rows("gradient of a cached view must be finite", d_image, pixels, channels, -kLargest, kLargest);
   const Kernels<T> &kernel = kernels<T>();
   const Buffer<T> upstream(blocks * channels * kPixels);
-#pragma omp parallel for num_threads(threads)
-  for (int64_t block = 0; block < blocks; ++block)
+  for_each(blocks, threads, [&](int64_t block) {
     kernel.cached_weights_upstream(grid_, block, d_image, channels,
                                    upstream.data() + block * channels * kPixels);
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 64)
-  for (int64_t i = 0; i < n_; ++i) {
+  });
+  for_each_in_turn(n_, threads, kRowsAtOnce, [&](int64_t i, int) {
     const int64_t begin = row_begin_[i];
     kernel.cached_weights_backward(row_begin_[i + 1] - begin, entries_.data() + begin, blocks_.data() + begin,
                                    weights_.data(), upstream.data(), channels, d_values + i * channels);
-  }
+  });
 }
 
 template class CachedWeights<float>;

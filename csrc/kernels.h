@@ -10,6 +10,7 @@
 #include <cstring>
 
 #include "attention.h"
+#include "code_table.h"
 #include "squared_error.h"
 #include "ssim.h"
 
@@ -183,6 +184,7 @@ constexpr int kSlotHead = 8;  // where wide channels begin
 //   none of which waits for another of its round.
 // ssim_*: rows [begin, end), all channels; with scratch as large as the *_scratch of its direction says.
 // squared_error_*: pixels [begin, end), few enough for sums in T.
+// code_table_pixels: pixels [begin, end); how many of them lack a node.
 // clang-format off
 #define VLGS_KERNELS(KERNEL)                                                                                     \
   KERNEL(void, project, const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end)                     \
@@ -212,7 +214,8 @@ constexpr int kSlotHead = 8;  // where wide channels begin
   KERNEL(int64_t, ssim_backward_scratch, const Ssim<T> &)                                                        \
   KERNEL(void, ssim_backward_rows, const Ssim<T> &, const SsimGrads<T> &, int64_t begin, int64_t end, T *scratch) \
   KERNEL(ErrorSum, squared_error_chunk, const SquaredError<T> &, int64_t begin, int64_t end)                     \
-  KERNEL(void, squared_error_chunk_backward, const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end)
+  KERNEL(void, squared_error_chunk_backward, const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end)\
+  KERNEL(int64_t, code_table_pixels, const CodeTable<T> &, int64_t begin, int64_t end)
 // clang-format on
 
 template <class T>

@@ -1,7 +1,5 @@
 #include "rasterizer.h"
 
-#include <omp.h>
-
 #include <algorithm>
 #include <atomic>
 #include <limits>
@@ -145,11 +143,10 @@ void Rasterized<T>::fill_records(Stage &s, const Splats<T> &splats, int threads)
   s.records = Buffer<T>(order_.count * kRecord);
   p.records = s.records.data();
   std::atomic<bool> bad = false;
-#pragma omp parallel for num_threads(threads)
-  for (int64_t i = 0; i < n_; ++i) {
+  for_each(n_, threads, [&](int64_t i) {
     if (const uint32_t next = order_.rank_of[std::min(i + kAhead, n_ - 1)]; next != kCulled)
       __builtin_prefetch(p.records + next * int64_t(kRecord), 1);
-    if (order_.rank_of[i] == kCulled) continue;
+    if (order_.rank_of[i] == kCulled) return;
     T *g = s.records.data() + order_.rank_of[i] * int64_t(kRecord);
     const T *mean = splats.mean2d + 2 * i, *ellipse = splats.ellipse + 3 * i;
     g[kMeanX] = mean[0], g[kMeanY] = mean[1];
@@ -166,7 +163,7 @@ void Rasterized<T>::fill_records(Stage &s, const Splats<T> &splats, int threads)
       if (any_not_finite(values, part.channels)) bad = true;
       if (p.narrow) std::copy(values, values + 3, g + kValues + 3 * k);
     }
-  }
+  });
   if (!bad) return;
   for (const Part<T> &part : s.parts)
     check_rows("groups[" + std::to_string(part.group) + "].values must be finite", part.values, n_,
@@ -198,11 +195,9 @@ void Rasterized<T>::render(Stage &s, bool keep, int threads) const {
                 list_size = lists_.longest + kListSlack;
   const Buffer<T> scratch(threads * size);
   const Buffer<uint32_t> list(threads * list_size);
-#pragma omp parallel for num_threads(threads) schedule(dynamic)
-  for (int64_t tile = 0; tile < tiles; ++tile) {
-    const int t = omp_get_thread_num();
+  for_each_in_turn(tiles, threads, 1, [&](int64_t tile, int t) {
     kernel.rasterize_forward(p, tile, scratch.data() + t * size, list.data() + t * list_size);
-  }
+  });
 }
 
 // Sum of the slots of every rank, in the order of the tiles whatever the threads: [m, summed]. Wide channels
@@ -224,25 +219,22 @@ Buffer<T> Rasterized<T>::sum_slots(const Pass<T> &p, T *const *d_values, int thr
   const int64_t scratch_size = kernel.rasterize_backward_scratch(p, lists_.longest);
   Buffer<T> sums(num_sums), slots(most * size), scratch(threads * scratch_size);
   std::atomic<bool> bad = false;
-#pragma omp parallel num_threads(threads)
-  {
-#pragma omp for schedule(static)
-    for (int64_t i = 0; i < num_sums; ++i) sums[i] = 0;
-    for (size_t s = 0; s + 1 < strips.size(); ++s) {
-      const int64_t base = p.tile_begin[strips[s]];
-#pragma omp for schedule(dynamic)
-      for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile) {
-        T *mine = scratch.data() + omp_get_thread_num() * scratch_size;
-        if (!kernel.rasterize_backward(p, tile, mine, slots.data() + (p.tile_begin[tile] - base) * size))
-          bad = true;
-      }
-#pragma omp for schedule(static, 1)
-      for (int t = 0; t < threads; ++t) {
-        const Range ranks = share(order_.count, t, threads);
-        for (int64_t tile = strips[s]; tile < strips[s + 1]; ++tile)
-          add_slots(p, tile, ranks, slots.data() + (p.tile_begin[tile] - base) * size, sums.data(), d_values);
-      }
-    }
+  for_shares(threads, [&](int t) {
+    const Range mine = share(num_sums, t, threads);
+    std::fill(sums.data() + mine.begin, sums.data() + mine.end, T(0));
+  });
+  for (size_t s = 0; s + 1 < strips.size(); ++s) {
+    const int64_t first = strips[s], base = p.tile_begin[first];
+    const auto slots_of = [&](int64_t tile) { return slots.data() + (p.tile_begin[tile] - base) * size; };
+    for_each_in_turn(strips[s + 1] - first, threads, 1, [&](int64_t i, int t) {
+      if (!kernel.rasterize_backward(p, first + i, scratch.data() + t * scratch_size, slots_of(first + i)))
+        bad = true;
+    });
+    for_shares(threads, [&](int t) {
+      const Range ranks = share(order_.count, t, threads);
+      for (int64_t tile = first; tile < strips[s + 1]; ++tile)
+        add_slots(p, tile, ranks, slots_of(tile), sums.data(), d_values);
+    });
   }
   if (bad) refuse_upstream(p);
   return sums;
@@ -258,8 +250,7 @@ void Rasterized<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buff
   T *const *d_weights = d.d_weights.data() + s.first_chain, *const *d_values =
                                                                 d.d_values.data() + s.first_part;
   std::atomic<bool> bad = false;
-#pragma omp parallel for num_threads(threads)
-  for (int64_t i = 0; i < n_; ++i) {
+  for_each(n_, threads, [&](int64_t i) {
     static constexpr T kNothing[kRecord] = {};
     const bool seen = order_.rank_of[i] != kCulled;
     if (const uint32_t next = order_.rank_of[std::min(i + kAhead, n_ - 1)]; next != kCulled) {
@@ -285,7 +276,7 @@ void Rasterized<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buff
       else
         std::fill(to, to + part.channels, T(0));
     }
-    if (!seen || !p.shape_grads) continue;
+    if (!seen || !p.shape_grads) return;
     const T a = g[kInvSigmaX], slope = g[kSlope], b = g[kInvSigmaY];
     if (T *d_mean = d.d_mean2d + 2 * i; d.d_mean2d) {
       d_mean[0] += kPerOctave2 * a * sum[kMomentU];
@@ -296,7 +287,7 @@ void Rasterized<T>::write_gradients(const Stage &s, const Pass<T> &p, const Buff
       d_ellipse[1] += kPerOctave2 * (a / b) * sum[kMomentUV];
       d_ellipse[2] -= kPerOctave * sum[kMomentVV] / b;
     }
-  }
+  });
   if (!bad) return;
   for (int c = 0; c < p.chains; ++c)
     if (d_weights[c])
@@ -360,8 +351,8 @@ void Rasterized<T>::median_rows(int64_t *rows, int threads) const {
   if (!p.transmittance)
     throw std::invalid_argument("rasterize: keep must be true where the median is asked for, got false");
   const int64_t tiles = grid_.tiles_x * grid_.tiles_y;
-#pragma omp parallel for num_threads(worth(lists_.begin.back() + tiles, threads)) schedule(dynamic)
-  for (int64_t tile = 0; tile < tiles; ++tile) kernels<T>().median_rows(p, tile, rows);
+  for_each_in_turn(tiles, worth(lists_.begin.back() + tiles, threads), 1,
+                   [&](int64_t tile, int) { kernels<T>().median_rows(p, tile, rows); });
 }
 
 template <class T>

@@ -3,6 +3,7 @@
 
 #include "buffer_pool.h"
 #include "kernels.h"
+#include "threads.h"
 
 namespace vlgs {
 namespace {
@@ -28,9 +29,8 @@ template <class T>
 ErrorSum squared_error(const SquaredError<T> &e, int threads) {
   const Chunks<T> chunks{e};
   const Buffer<ErrorSum> sums(chunks.count);
-#pragma omp parallel for num_threads(chunks.threads(threads))
-  for (int64_t c = 0; c < chunks.count; ++c)
-    sums[c] = kernels<T>().squared_error_chunk(e, chunks.begin(c), chunks.end(c));
+  for_each(chunks.count, chunks.threads(threads),
+           [&](int64_t c) { sums[c] = kernels<T>().squared_error_chunk(e, chunks.begin(c), chunks.end(c)); });
   ErrorSum total = {0, 0};
   for (int64_t c = 0; c < chunks.count; ++c) total.sum += sums[c].sum, total.pixels += sums[c].pixels;
   return total;
@@ -39,9 +39,9 @@ ErrorSum squared_error(const SquaredError<T> &e, int threads) {
 template <class T>
 void squared_error_backward(const SquaredError<T> &e, T scale, T *d_a, int threads) {
   const Chunks<T> chunks{e};
-#pragma omp parallel for num_threads(chunks.threads(threads))
-  for (int64_t c = 0; c < chunks.count; ++c)
+  for_each(chunks.count, chunks.threads(threads), [&](int64_t c) {
     kernels<T>().squared_error_chunk_backward(e, scale, d_a, chunks.begin(c), chunks.end(c));
+  });
 }
 
 template ErrorSum squared_error(const SquaredError<float> &, int);

@@ -15,11 +15,10 @@ template <class T, class Call>
 void for_bands(const Ssim<T> &s, int64_t scratch_size, int threads, Call call) {
   const int bands = int(std::clamp<int64_t>(s.height / kWorthBand, 1, threads));
   const Buffer<T> scratch(bands * scratch_size);
-#pragma omp parallel for num_threads(bands) schedule(static, 1)
-  for (int band = 0; band < bands; ++band) {
+  for_shares(bands, [&](int band) {
     const Range rows = share(s.height, band, bands);
     call(rows.begin, rows.end, scratch.data() + band * scratch_size);
-  }
+  });
 }
 
 }  // namespace

@@ -81,20 +81,18 @@ void colour(const T *color, const T *sh, const T *b, T *out) {
 
 template <int kDegree, class T>
 void rows(const ViewColor<T> &v, T *out, int threads) {
-#pragma omp parallel for num_threads(threads)
-  for (int64_t i = 0; i < v.n; ++i) {
+  for_each(v.n, threads, [&](int64_t i) {
     T b[kMost];
     basis<kDegree>(direction(v.means + 3 * i, v.eye), b);
     colour<kDegree>(v.color + 3 * i, v.sh + 3 * v.coefficients * i, b, out + 3 * i);
     // What is not a number stays, for the rasterizer to refuse.
     for (int c = 0; c < 3; ++c) out[3 * i + c] = out[3 * i + c] < 0 ? T(0) : out[3 * i + c];
-  }
+  });
 }
 
 template <int kDegree, class T>
 void rows_backward(const ViewColor<T> &v, const T *d_out, T *d_color, T *d_sh, T *d_means, int threads) {
-#pragma omp parallel for num_threads(threads)
-  for (int64_t i = 0; i < v.n; ++i) {
+  for_each(v.n, threads, [&](int64_t i) {
     T b[kMost], d_basis[kMost], value[3], d[3], d_direction[3];
     const Direction<T> to = direction(v.means + 3 * i, v.eye);
     basis<kDegree>(to, b);
@@ -115,7 +113,7 @@ void rows_backward(const ViewColor<T> &v, const T *d_out, T *d_color, T *d_sh, T
     d_means[3 * i] = (d_direction[0] - along * to.x) * inverse;
     d_means[3 * i + 1] = (d_direction[1] - along * to.y) * inverse;
     d_means[3 * i + 2] = (d_direction[2] - along * to.z) * inverse;
-  }
+  });
 }
 
 }  // namespace

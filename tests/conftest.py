@@ -1,10 +1,66 @@
 """What several areas need: a small procedural scene, read once, and the folder of real data."""
 
+import functools
+import importlib
+import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from vlgs.types import Scene
+# Two workers with two threads each on two cores: a thread that waits must not keep the core of one that works. Read when torch is loaded,
+# here and in every process that a test starts.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# While a module of vlgs is imported, jaxtyping looks for compiled files under names of its own, also for all that this module imports: without
+# this, 3 500 modules of other packages would be compiled anew in every worker.
+for _name in ("torch", "torchmetrics", "lightning.pytorch.loggers", "kornia", "matplotlib.pyplot", "pandas", "viser"):  # fmt: skip
+    try:
+        importlib.import_module(_name)
+    except ImportError:  # an extra that is not installed
+        continue
+
+from vlgs.types import Scene  # noqa: E402
+
+
+@pytest.fixture(scope="session", autouse=True)
+def traced_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Runs have a results folder each, and in it a cache of photographs; what one test has traced is laid into the next one's cache."""
+    from vlgs.data.synthetic import capture
+
+    base = tmp_path_factory.getbasetemp()
+    common = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    original = capture._photographs
+
+    def photographs(world: Any, cameras: Any, settings: Any, cache: Path | None) -> Any:
+        if cache is None:
+            return original(world, cameras, settings, None)
+        name = f"capture-{settings.fingerprint(level=0)}.npz"
+        kept = common / name
+        if kept.is_file() and not (cache / name).exists():
+            cache.mkdir(parents=True, exist_ok=True)
+            shutil.copy(kept, cache)
+        photos = original(world, cameras, settings, cache)
+        if not kept.is_file():
+            shutil.copy(cache / name, base)
+            (base / name).replace(kept)
+        return photos
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(capture, "_photographs", photographs)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def frame_rates_of_few_views() -> Iterator[None]:
+    """A run takes up to five seconds to measure its frame rates, which no test compares."""
+    from vlgs import finish
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finish, "measure_fps", functools.partial(finish.measure_fps, seconds=0.0))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# Threads that spin at a barrier while another process has the second core made a training step 50 times slower here (768 ms
-# against 15 ms); sleeping costs 2 ms on an idle machine. Read by libgomp when torch loads it; whoever set it keeps it.
+# PyTorch's threads that spin at a barrier while another process has the second core made a training step 50 times slower here
+# (768 ms against 15 ms). Read by libgomp when torch loads it; whoever set it keeps it. The kernel's threads are its own.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOME = {

@@ -1,4 +1,7 @@
-"""The compiled kernel (csrc/bindings.cpp). Arrays are contiguous CPU tensors of one dtype; outputs are written in place."""
+"""The compiled kernel (csrc/bindings.cpp).
+
+Arrays are contiguous CPU tensors of one dtype, or what `vlgs.ops.arrays` makes of them; outputs are written in place.
+"""
 
 from collections.abc import Sequence
 
@@ -11,6 +14,7 @@ def isas() -> str:
     """The instruction sets that were compiled and run on this machine, best first, separated by blanks."""
 
 def peak_fma(packs: int) -> int: ...
+def keep_freed_memory(on: bool) -> None: ...
 
 class Camera:
     def __init__(
@@ -188,6 +192,16 @@ def squared_error_backward(
     d_a: Tensor,
     threads: int,
 ) -> None: ...
+def code_table(
+    codes: Tensor,
+    low: float,
+    per_unit: float,
+    places: Tensor,
+    rows: Tensor,
+    out: Tensor,
+    threads: int,
+) -> int:
+    """How many codes lack a node."""
 
 class CachedWeightsFloat:
     def __init__(self, picture: RasterizedFloat, threads: int) -> None: ...

@@ -11,6 +11,7 @@ from torch.nn.functional import l1_loss
 
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import ssim as ops_ssim
+from vlgs.ops.absolute_error import absolute_error
 from vlgs.ops.squared_error import Pixels, squared_error
 
 L1_SHARE = 0.8
@@ -48,7 +49,7 @@ def masked_l1(
     """Mean absolute error; otherwise as `masked_mse`."""
     _require_shapes("masked_l1", render, target, valid)
     if valid is None:
-        return l1_loss(render, target)
+        return absolute_error(render, target)
     total = l1_loss(render, _filled(target, valid, render), reduction="sum")
     return total / _count(render, valid, pixels)
 

@@ -2,13 +2,12 @@
 
 import random
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from tests.fuzz.commands import command
 from vlgs.arguments import command_line, quote_places
 
 ODD = (
@@ -71,8 +70,7 @@ def test_commas_separate_values_of_a_sweep():
 
 def test_an_odd_folder_that_is_not_there_is_named(tmp_path: Path):
     root = tmp_path / "Ünï (1), [b]=c"
-    command = [sys.executable, "-m", "vlgs.run", "data=colmap", f"data.root={root}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 1
-    assert f"no such folder as {root}" in done.stderr
-    assert "Traceback" not in done.stderr
+    done = command("run", ["data=colmap", f"data.root={root}", f"results={tmp_path}/results"])
+    assert done.status == 1
+    assert f"no such folder as {root}" in done.error
+    assert "Traceback" not in done.text

@@ -1,12 +1,11 @@
 """What options ask of each other is said by the options, and checked in one place for all commands."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from tiny_runs import composed
 
+from tests.fuzz.commands import command
 from vlgs.check import Report, start
 from vlgs.demands import Demand, unmet
 from vlgs.experiment import construct
@@ -73,11 +72,8 @@ def test_what_says_nothing_has_no_property():
 
 def test_the_command_says_it_too(tmp_path: Path):
     """Inside of Hydra's own program, which allows no second one."""
-    done = subprocess.run(
-        [sys.executable, "-m", "vlgs.run", "sharing=none", f"results={tmp_path}"],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1
-    said = "error: config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, got self"
-    assert done.stderr.strip() == said
+    done = command("run", ["sharing=none", f"results={tmp_path}"])
+    assert done.status == 1
+    said = "config: fusion must be none with sharing=none, as a Gaussian then carries colour or language but not both, got self"
+    assert done.error == said
+    assert done.text.strip() == f"error: {said}"

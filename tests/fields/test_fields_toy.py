@@ -11,7 +11,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from vlgs.fields import NO_GAUSSIANS, Field, FieldImages, gaussians_of, require_outputs
+from vlgs.fields import (
+    NO_GAUSSIANS,
+    Field,
+    FieldImages,
+    faster,
+    gaussians_of,
+    require_outputs,
+)
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.fields.several import SeveralFields
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
@@ -96,6 +103,11 @@ def scene() -> Scene:
 
 def score(scene: Scene, protocol: EvaluationProtocol | Auto) -> Evaluation:
     return evaluate(Ball(), scene, QUERY, TEXT, protocol)
+
+
+def test_what_knows_no_faster_way_stays_itself():
+    ball = Ball()
+    assert faster(ball, 0.1) is ball
 
 
 def test_it_is_a_field_and_has_no_gaussians(tmp_path: Path):

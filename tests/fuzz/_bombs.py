@@ -94,15 +94,19 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png(width: int, height: int, *chunks: bytes, color: int = 2) -> Write:
-    header = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0))
-    data = _chunk(b"IDAT", zlib.compress(bytes(100_000)))
-    end = _chunk(b"IEND", b"")
-    return raw(b"\x89PNG\r\n\x1a\n" + header + b"".join(chunks) + data + end)
+def png(width: int, height: int, *chunks: Callable[[], bytes], color: int = 2) -> Write:
+    def write(path: Path) -> None:
+        header = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0))
+        data = _chunk(b"IDAT", zlib.compress(bytes(100_000)))
+        between = b"".join(chunk() for chunk in chunks)
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + between + data + _chunk(b"IEND", b""))
+
+    return write
 
 
-def unfolding_chunk(kind: bytes, prefix: bytes) -> bytes:
-    return _chunk(kind, prefix + zlib.compress(bytes(300_000_000), 1))
+def unfolding_chunk(kind: bytes, prefix: bytes) -> Callable[[], bytes]:
+    """Made when the file is written: it takes a second."""
+    return lambda: _chunk(kind, prefix + zlib.compress(bytes(300_000_000), 1))
 
 
 def jpeg_of_many_scans(path: Path) -> None:

@@ -213,9 +213,12 @@ def attack(folder: Path, bomb: Bomb) -> Attack:
     name, unit, file, read, write, must_refuse = bomb
     there = folder / "attack" / unit
     path = there / file
-    shutil.rmtree(folder / "attack", ignore_errors=True)
-    shutil.copytree(folder / "corpus" / unit, there)
-    (there / "out").mkdir()
-    path.unlink(missing_ok=True)
-    in_a_child(lambda: write(path))
-    return Attack(name, lambda: read(path, there), must_say=path.name, must_refuse=must_refuse)
+
+    def lay() -> None:
+        shutil.rmtree(folder / "attack", ignore_errors=True)
+        shutil.copytree(folder / "corpus" / unit, there)
+        (there / "out").mkdir()
+        path.unlink(missing_ok=True)
+        in_a_child(lambda: write(path))
+
+    return Attack(name, lambda: read(path, there), path.name, must_refuse, prepare=lay)

@@ -5,6 +5,7 @@ traceback of something else. Children are forked from a parent that has imported
 thousands of attacks take minutes.
 """
 
+import importlib
 import json
 import os
 import re
@@ -14,8 +15,11 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from vlgs.report.provenance import PACKAGE
 
 SECONDS = 10.0
 ENDLESS = 300
@@ -38,6 +42,8 @@ class Attack:
     """What an error must contain: the name of the file, the key."""
     must_refuse: bool = False
     """Whether taking it without an error is wrong."""
+    prepare: Callable[[], object] = lambda: None
+    """What must be done before, for an attack that is tried; its time and memory do not count."""
     endless: int = ENDLESS
     """Seconds by the clock after which a child that waits for something is ended."""
 
@@ -57,7 +63,9 @@ class AttackOutcome:
 
 
 def run_attack(attack: Attack) -> AttackOutcome:
-    """Fork, attack, judge."""
+    """Prepare, fork, attack, judge."""
+    attack.prepare()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with tempfile.TemporaryFile() as pipe:
         child = os.fork()
         if child == 0:
@@ -65,12 +73,13 @@ def run_attack(attack: Attack) -> AttackOutcome:
         _, status, usage = os.wait4(child, 0)
         pipe.seek(0)
         try:
-            kind, said = json.load(pipe)
+            kind, said, imported = json.load(pipe)
         except json.JSONDecodeError:
-            kind, said = "died", f"the process ended with {os.waitstatus_to_exitcode(status)}"
+            ended = f"the process ended with {os.waitstatus_to_exitcode(status)}"
+            kind, said, imported = "died", ended, []
     seconds = usage.ru_utime + usage.ru_stime
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     megabytes = max(0, usage.ru_maxrss - before) / 1024
+    _import(imported)
     return AttackOutcome(
         attack.name, *_judge(attack, kind, said, seconds, megabytes), seconds, megabytes
     )
@@ -94,8 +103,24 @@ def _judge(
     return True, said
 
 
+def _import(names: list[str]) -> None:
+    """What one child has imported on its way, the next ones have from their parent."""
+    for name in names:
+        with suppress(ImportError):
+            importlib.import_module(name)
+
+
+def _trusted() -> list[str]:
+    """Modules of this project and of what is installed; not those that an attack brought along."""
+    places = (f"{PACKAGE}/", f"{sys.prefix}/lib/", f"{sys.base_prefix}/lib/")
+    files = ((name, getattr(module, "__file__", None)) for name, module in sys.modules.items())
+    found = [name for name, file in files if file and file.startswith(places)]
+    return [name for name in found if not name.startswith(("pycolmap", "__m"))]
+
+
 def _child(attack: Attack, out: int) -> None:
     """Attack and tell; never returns."""
+    before = set(sys.modules)
     resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
     signal.alarm(attack.endless)
     with tempfile.TemporaryFile() as noise:
@@ -118,7 +143,7 @@ def _child(attack: Attack, out: int) -> None:
         except BaseException:
             told = ("crashed", traceback.format_exc(limit=-3))
     with os.fdopen(os.dup(out), "w") as file:
-        json.dump(told, file)
+        json.dump([*told, [name for name in _trusted() if name not in before]], file)
     os._exit(0)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.code_table import LANES, code_table
 from vlgs.ops.depth import camera_depth, render_depth
 from vlgs.ops.machine import peak_fma
 from vlgs.ops.view_color import view_color
@@ -45,6 +46,7 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
         bad = float(rng.choice(poison)) if rng.random() < 0.25 else None
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
     _squared_error(rng, poison)
+    _code_table(np.random.default_rng([seed, 2]), poison)
     packs = int(rng.integers(0, 1000))
     _require(peak_fma(packs) >= packs, "peak_fma did less than it was asked for")
 
@@ -185,6 +187,32 @@ def _squared_error(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
     _agree("gradient of a squared error", d_render, d_gaps, in_range, eps)
     opposite = torch.equal(d_target.nan_to_num(7), (-d_render).nan_to_num(7))
     _require(opposite, "squared error: gradients must be opposite")
+
+
+def _code_table(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
+    """Codes anywhere and nowhere, places that are no rows: an answer is a mean of its eight nodes, or not a number."""
+    dtype, side, words = _dtype(rng), int(rng.integers(2, 7)), int(rng.choice([1, 7, 8, 9]))
+    n, count = int(rng.choice([*ROWS, *LONG, 4095, 4097, 9000])), side**3
+    codes = _normal(rng, dtype, n, 3)
+    if n:
+        for _ in range(int(rng.integers(0, 6))):
+            codes.view(-1)[int(rng.integers(3 * n))] = _cast(
+                rng.choice([*poison, -1.5, 1.5]), dtype
+            )
+    places = torch.from_numpy(rng.permutation(count)).int().view(side, side, side)
+    odd = torch.from_numpy(rng.random((side, side, side)) < rng.choice([0.0, 0.01]))
+    places[odd] = int(rng.choice([-1, -(2**31), count, 2**31 - 1]))
+    rows = _normal(rng, dtype, count, -(-words // LANES) * LANES)
+    answers, lacking = code_table(codes, 1.5, places, rows, words)
+    unknown = answers.isnan()
+    _require(bool((unknown == unknown[0]).all()), "code_table: words must lack the same codes")
+    _require(int(unknown[0].sum()) == lacking, "code_table: lacking codes must be counted")
+    beyond = ~((codes >= -1.5) & (codes < 1.5)).all(dim=1)
+    least = int(beyond.sum())
+    _require(lacking >= least, "code_table: codes beyond it must be lacking")
+    _require(lacking == least or bool(odd.any()), "code_table: no other code is lacking")
+    most = rows.abs().amax() * (1 + 1e2 * torch.finfo(dtype).eps)
+    _require(bool((answers[~unknown].abs() <= most).all()), "code_table: answers must be means")
 
 
 def _agree(name: str, got: Tensor, want: Tensor, in_range: Tensor, relative: float) -> None:

@@ -12,6 +12,7 @@ import vlgs.ops
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.code_table import code_table
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.ssim import KERNELS
 from vlgs.ops.view_color import view_color
@@ -37,6 +38,7 @@ CALLS: dict[str, Callable[[], object]] = {
     "squared_error": lambda: masked_mse(there(4, 5, 3), there(4, 5, 3)),
     "ssim": lambda: ssim_map(there(4, 5, 3), there(4, 5, 3)),
     "l1_dssim": lambda: l1_dssim(there(4, 5, 3), there(4, 5, 3)),
+    "code_table": lambda: code_table(there(4, 3), 1.0, there(2, 2, 2).int(), there(8, 8), 5),
     "project of a cached view": lambda: CachedView(
         *GAUSSIANS, there(5), Camera(torch.eye(4), K, 4, 4), RasterConfig()
     ),

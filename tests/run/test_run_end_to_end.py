@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import TINY, composed
 
+from tests.fuzz.commands import command as in_process
 from vlgs.config import CONF
 from vlgs.report.results import METRICS
 from vlgs.run import run
@@ -204,16 +205,20 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path):
 )
 def test_bad_input_is_one_clear_error(tmp_path: Path, override: str, words: list[str]):
     extra = [] if "data=" in override else list(TINY)
-    done = subprocess.run(
-        command(*extra, *override.split(), f"results={tmp_path}"),
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert done.returncode != 0
-    assert "Traceback" not in done.stderr
+    said = in_process("run", [*extra, *override.split(), f"results={tmp_path}"])
+    assert said.status != 0
+    assert "Traceback" not in said.text
     for word in words:
-        assert word in done.stderr, done.stderr
+        assert word in said.text, said.text
+
+
+def test_an_error_ends_the_process(tmp_path: Path):
+    done = subprocess.run(
+        command("seed=0.5", f"results={tmp_path}"), capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: config: seed must be a whole number, got 0.5\n"
+    assert not done.stdout
 
 
 def test_help_is_a_manual_and_needs_no_torch():

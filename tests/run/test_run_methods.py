@@ -1,7 +1,7 @@
 """What every option of conf/method does, whichever system it is: train, stop, go on, be read back, and answer as a field."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,12 @@ import torch
 from omegaconf import DictConfig
 from tiny_runs import TINY, composed
 
+import vlgs.fields.language_field
 import vlgs.finish
 import vlgs.training.checkpoint
 from vlgs.config import CONF
 from vlgs.fields import Field, HasGaussians
+from vlgs.fields.hash_grid import GridConfig, HashGrid
 from vlgs.files import write_atomically
 from vlgs.known import options
 from vlgs.manual import list_options
@@ -33,6 +35,9 @@ SHORT = (
     "pictures=false",
 )
 METHODS = options("method")
+RAYS = ("+stages.0.rays=256", "+stages.0.batches=1", "+stages.1.rays=256")
+SHORTER = {"lerf": (*RAYS, "stages.1.scales=2"), "opennerf": RAYS}
+"""Method -> what makes it quick, where an iteration takes long."""
 
 
 def short(*overrides: str) -> DictConfig:
@@ -79,6 +84,10 @@ class Runner:
             if len(self.written) == self.last:
                 raise KilledError
 
+        def small(config: GridConfig, generator: torch.Generator) -> HashGrid:
+            return HashGrid(replace(config, log2_table=8), generator)
+
+        monkeypatch.setattr(vlgs.fields.language_field, "HashGrid", small)
         monkeypatch.setattr(vlgs.finish, "report", reporting)
         monkeypatch.setattr(vlgs.training.checkpoint, "write_atomically", writing)
 
@@ -97,21 +106,21 @@ def runner(monkeypatch: pytest.MonkeyPatch) -> Runner:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_it_trains_stops_goes_on_and_comes_back(tmp_path: Path, runner: Runner, method: str):
-    chosen = f"method={method}"
-    whole = runner(tmp_path / "whole", chosen, "threads=2")
+    chosen = (f"method={method}", *SHORTER.get(method, ()))
+    whole = runner(tmp_path / "whole", *chosen, "threads=2")
     require_scores(whole)
     require_field(whole)
 
     with pytest.raises(KilledError):
-        runner(tmp_path / "parts", chosen, "threads=1", last=max(1, len(whole.written) - 1))
-    parts = runner(tmp_path / "parts", chosen, "threads=1")
+        runner(tmp_path / "parts", *chosen, "threads=1", last=max(1, len(whole.written) - 1))
+    parts = runner(tmp_path / "parts", *chosen, "threads=1")
     assert parts.folder.path.name == whole.folder.path.name
     assert len(parts.written) < len(whole.written), "what was made is not made again"
     require_same(parts, whole)
 
     require_opened(whole)
     whole.folder.metrics.unlink()
-    back = runner(tmp_path / "whole", chosen)
+    back = runner(tmp_path / "whole", *chosen)
     assert not back.written
     require_same(back, whole)
 

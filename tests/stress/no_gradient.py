@@ -82,6 +82,10 @@ NO_GRADIENT = {
     )},
     "vlgs.ops.rasterize_to_pixels.weights_alone": "the constants of a CachedView",
     "vlgs.ops.depth.median_rows": "picks rows",
+    **{f"vlgs.fields.comparing.{name}": "training is over" for name in (
+        "Comparing.__call__", "Decoding.__call__", "Folding.__call__", "Folding.flat", "Tabulating.__call__",
+    )},
+    "vlgs.fields.similarity.unit_words": "words, which nothing moves",
     "vlgs.gsplat.example.draw": "goes through what is checked",
     "vlgs.gsplat.example.valid": "a mask",
     "vlgs.gsplat.view.ViewSplats.rows": "picks rows",

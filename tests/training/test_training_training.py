@@ -177,6 +177,25 @@ def test_densification_is_part_of_the_training_time(
     assert module.train_seconds == 200  # after 4 and 8 iterations
 
 
+@pytest.mark.parametrize(
+    ("iterations", "densified", "reset"), [(12, [4, 8], 0), (13, [4, 8, 12], 1)]
+)
+def test_a_budget_that_ends_on_a_densification_leaves_it_out(
+    tiny_scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    iterations: int,
+    densified: list[int],
+    reset: int,
+):
+    after: list[int] = []
+    resets: list[object] = []
+    monkeypatch.setattr("vlgs.training.callbacks.densify", lambda *args: after.append(args[6]))
+    monkeypatch.setattr("vlgs.training.callbacks.reset_opacity", lambda *args: resets.append(args))
+    train(module_of(tiny_scene, f"trainer.iterations={iterations}"), tmp_path)
+    assert (after, len(resets)) == (densified, reset)
+
+
 def test_a_large_gradient_is_no_fault(tiny_scene: Scene, tmp_path: Path):
     """Its square is infinite in float32, it is not."""
     module = module_of(tiny_scene, "trainer.iterations=1")

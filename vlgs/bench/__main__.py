@@ -151,6 +151,26 @@ def unseen(parser: ArgumentParser) -> Runner:
     return run
 
 
+def threads(parser: ArgumentParser) -> Runner:
+    """The rasterizer by which of torch and vlgs is imported first, idle and beside busy processes."""
+    parser.add_argument(
+        "--size", type=int, nargs=3, default=(10_000, 320, 240), metavar=("N", "W", "H")
+    )
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=40)
+
+    def run(args: Namespace) -> int:
+        from rich.console import Console
+
+        from vlgs.bench.threads import measure_threads, show_threads
+
+        size, repeats = ((500, 64, 48), 2) if args.quick else (args.size, args.repeats)
+        Console().print(show_threads(measure_threads(*size, args.threads, repeats)))
+        return 0
+
+    return run
+
+
 def overhead(parser: ArgumentParser) -> Runner:
     """What the Trainer adds to an iteration."""
     parser.add_argument("--iterations", type=int, default=300)
@@ -254,6 +274,32 @@ def startup(parser: ArgumentParser) -> Runner:
     return run
 
 
+def query(parser: ArgumentParser) -> Runner:
+    """An answer to a word beside its two renders: decoded, folded, tables of several sizes, and their errors."""
+    parser.add_argument(
+        "--run", type=Path, help="a run folder; default: train the procedural scene"
+    )
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=5)
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.presets import load_run, train_a_little, train_or_load
+        from vlgs.bench.query import LARGE, run_query
+        from vlgs.bench.train import QUICK
+
+        if args.run is not None:
+            trained = load_run(args.run)
+        elif args.quick:
+            trained = train_a_little([*QUICK, "head.cache_dir=null", f"seed={args.seed}"])
+        else:
+            trained = train_or_load([f"seed={args.seed}"], Path("results"))
+        large, repeats = ((300, 40, 30), 2) if args.quick else (LARGE, args.repeats)
+        run_query(trained, large, args.threads, repeats, args.out, args.seed)
+        return 0
+
+    return run
+
+
 SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     kernel,
     error,
@@ -261,11 +307,13 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     growth,
     train,
     unseen,
+    threads,
     overhead,
     seams,
     iteration,
     reading,
     protocols,
+    query,
     startup,
 )
 """Name, help and options of a subcommand are those of its function; `all` runs them in this order."""

@@ -29,8 +29,8 @@ from vlgs.data.views import ViewSource
 from vlgs.features.extractor import Extractor
 from vlgs.features.folder import FeatureFolder, pair_bytes
 
-_NO_NUMBER_MOVES = frozenset({"weights", "device", "batch"})
-"""Keys of an extractor that are not part of the settings of a folder."""
+_NO_NUMBER_MOVES = frozenset({"weights", "device", "batch", "labels", "vocabulary"})
+"""Keys of an extractor that are not part of the settings of a folder: speed, and places whose content `identity` has."""
 
 _VERSION = 1
 """Of the computation: to be raised when the same settings lead to other maps."""

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vlgs.types import Camera, DepthKind
+from vlgs.values import require_range
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,15 @@ class HasObjects(Protocol):
         ...
 
 
+@runtime_checkable
+class HasFaster(Protocol):
+    """What a field also is that can compare words without making the embedding of every pixel."""
+
+    def faster(self, within: float) -> Field:
+        """See `faster`."""
+        ...
+
+
 NO_GAUSSIANS = "the field has no Gaussians"
 """Why a figure that speaks of Gaussians is not available."""
 
@@ -163,6 +173,20 @@ def depth_of(field: Field, camera: Camera, kind: DepthKind = "expected") -> Floa
             f"depth: the field must know distances (HasDepth), got {type(field).__name__}"
         )
     return field.depth(camera, kind)
+
+
+def faster(field: Field, within: float = 0.0) -> Field:
+    """The same scene, which answers words with less work; itself, where there is no way. Scores are not made of it.
+
+    Args:
+        field: The trained scene.
+        within: By how much a cosine may be off, as far as that is measured (`vlgs.fields.comparing.Tabulating`); 0: by rounding alone.
+
+    Raises:
+        ValueError: If the bound is not in [0, 2].
+    """
+    require_range("faster", 0, 2, within=within)
+    return field.faster(within) if isinstance(field, HasFaster) else field
 
 
 def require_outputs(who: str, outputs: Iterable[str], had: frozenset[str]) -> None:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vlgs.fields import Field, FieldImages, depth_of, require_outputs
+from vlgs.fields import Field, FieldImages, depth_of, faster, require_outputs
 from vlgs.types import Camera, DepthKind
 
 
@@ -74,3 +74,7 @@ class SeveralFields:
     def depth(self, camera: Camera, kind: DepthKind = "expected") -> Float[Tensor, "h w"]:
         """See `HasDepth`: that of the first, as colour is."""
         return depth_of(self.fields[0], camera, kind)
+
+    def faster(self, within: float) -> "SeveralFields":
+        """See `HasFaster`."""
+        return SeveralFields([faster(field, within) for field in self.fields])

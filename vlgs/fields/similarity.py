@@ -32,6 +32,19 @@ def rendered_feature(
     return seen.feature if pixels is None else seen.feature.flatten(1, 2)[:, None, pixels]
 
 
+def require_one_space(features: int, text: int) -> None:
+    """Refuse text vectors of another width than the embeddings'.
+
+    Raises:
+        ValueError: Names both.
+    """
+    if features != text:
+        raise ValueError(
+            f"query: text vectors must be as wide as the decoded features ({features}), "
+            f"got {text}; both must come from one embedding space"
+        )
+
+
 def cosines(features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"]) -> Float[Tensor, " k *p"]:
     """Cosine of every text vector with every feature; a zero vector has cosine 0 with everything.
 
@@ -44,14 +57,10 @@ def cosines(features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"]) -> Floa
         >>> cosines(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.tensor([[2.0, 0.0]]))
         tensor([[0.6000, 0.0000]])
     """
-    if features.shape[-1] != text.shape[-1]:
-        raise ValueError(
-            f"query: text vectors must be as wide as the decoded features ({features.shape[-1]}), "
-            f"got {text.shape[-1]}; both must come from one embedding space"
-        )
+    require_one_space(features.shape[-1], text.shape[-1])
     flat = features.reshape(-1, features.shape[-1])
     norms = torch.linalg.vector_norm(flat, dim=-1).clamp_min(SMALLEST_NORM)  # [p]
-    products = _unit(text.to(flat.dtype)) @ flat.T  # [k, p]
+    products = unit_words(text.to(flat.dtype)) @ flat.T  # [k, p]
     return (products / norms).reshape(text.shape[0], *features.shape[:-1])
 
 
@@ -74,13 +83,14 @@ def decoded_cosines(
     """
     h, w, _ = codes.shape
     flat = codes.reshape(h * w, -1)
-    unit = _unit(text.to(codes.dtype))
+    unit = unit_words(text.to(codes.dtype))
     out = codes.new_empty(text.shape[0], h * w)
     for start in range(0, h * w, chunk):
         out[:, start : start + chunk] = cosines(decode(flat[start : start + chunk]), unit)
     return out.reshape(-1, h, w)
 
 
-def _unit(vectors: Float[Tensor, "k e"]) -> Float[Tensor, "k e"]:
+def unit_words(vectors: Float[Tensor, "k e"]) -> Float[Tensor, "k e"]:
+    """Words at unit length; zero ones stay zero."""
     norms = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
     return vectors / norms.clamp_min(SMALLEST_NORM)

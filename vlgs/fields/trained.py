@@ -1,6 +1,7 @@
 """A trained `SplatModel` as a field."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from vlgs.fields import Field, FieldImages, PointCloud, require_outputs
 from vlgs.fields.cloud import point_cloud
-from vlgs.fields.similarity import CHUNK, decoded_cosines, rendered_feature
+from vlgs.fields.comparing import Comparing, Decoding, comparing
+from vlgs.fields.similarity import CHUNK, rendered_feature
 from vlgs.fields.splat import FusedGaussians, SplatModel
 from vlgs.heads.classifier import Classifier
 from vlgs.ops.depth import render_depth
@@ -25,6 +27,7 @@ class SplatField:
         color: Off: it was trained for language alone, and renders no colour.
         level: Place of the one mask level that is asked, from 0; None: all that the model has.
         language: Off: it was trained for colour alone, and answers no word.
+        compare: How codes are compared with words; None: decoded.
 
     Raises:
         ValueError: If the model has no such level.
@@ -36,6 +39,7 @@ class SplatField:
         color: bool = True,
         level: int | None = None,
         language: bool = True,
+        compare: Comparing | None = None,
     ) -> None:
         if level is not None and not 0 <= level < model.levels:
             raise ValueError(f"splat field: level must be below {model.levels}, got {level}")
@@ -43,6 +47,7 @@ class SplatField:
         self.color = color
         self.level = level
         self.has_language = language
+        self.compare = Decoding(model.head) if compare is None else compare
 
     @property
     def outputs(self) -> frozenset[str]:
@@ -74,8 +79,15 @@ class SplatField:
         seen: FieldImages | None = None,
         pixels: Int[Tensor, " p"] | None = None,
     ) -> Float[Tensor, "levels k h w"]:
-        """See `Field`: cosines with the decoded codes."""
+        """See `Field`: cosines with the embeddings of codes."""
         return self._compare(rendered_feature(self, camera, seen, pixels), words)
+
+    def faster(self, within: float) -> "SplatField":
+        """See `HasFaster`: of the same kind, with the same Gaussians."""
+        made = copy(self)
+        made.compare = comparing(self.model.head, within)
+        vars(made).pop("_each", None)  # levels compare as they were made to
+        return made
 
     def opacities(self) -> Float[Tensor, " n"]:
         """See `HasGaussians`."""
@@ -142,7 +154,10 @@ class SplatField:
 
     @cached_property
     def _each(self) -> Sequence[Field]:
-        return [SplatField(self.model, self.color, level) for level in range(self.model.levels)]
+        return [
+            SplatField(self.model, self.color, level, compare=self.compare)
+            for level in range(self.model.levels)
+        ]
 
     @cached_property
     def _fused(self) -> FusedGaussians:
@@ -166,8 +181,7 @@ class SplatField:
     def _compare(
         self, codes: Float[Tensor, "levels h w d"], words: Float[Tensor, "k e"]
     ) -> Float[Tensor, "levels k h w"]:
-        decode = self.model.head.decode
-        return _stack([decoded_cosines(decode, level, words) for level in codes])
+        return _stack([self.compare(level, words) for level in codes])
 
 
 class ObjectField(SplatField):

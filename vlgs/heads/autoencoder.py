@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vlgs.files import write_atomically
+from vlgs.heads.folded import Folded, fold_linear
 from vlgs.heads.threads import one_thread
 from vlgs.values import require_range
 
@@ -188,6 +189,17 @@ class Autoencoder(nn.Module):
         """
         self._require_fitted()
         return normalize(self.decoder(codes) + self.mean, dim=-1)
+
+    def fold(self) -> Folded:
+        """See `vlgs.heads.folded.Foldable`: the decoder without its last layer.
+
+        Raises:
+            ValueError: If nothing has been fitted or loaded.
+        """
+        self._require_fitted()
+        *hidden, last = self.decoder
+        assert isinstance(last, nn.Linear)  # `build`
+        return fold_linear(last.weight, last.bias + self.mean, nn.Sequential(*hidden))
 
     def build(self, embedding_dim: int) -> None:
         """Lay out both networks for an embedding width; indices and shapes are those of LangSplat's checkpoints."""

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.heads.folded import Folded, fold_linear, fold_rows
 from vlgs.heads.rows import linear_rows
 from vlgs.values import require_choice, require_range
 
@@ -85,6 +86,12 @@ class Classifier(nn.Module):
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `vlgs.heads.Head`; `predict` at unit length."""
         return normalize(self.predict(codes), dim=-1, eps=1e-6)
+
+    def fold(self) -> Folded:
+        """See `vlgs.heads.folded.Foldable`."""
+        if self.answer == "most_probable":
+            return fold_rows(self.vectors, lambda codes: self.logits(codes).argmax(dim=-1))
+        return fold_linear(self.vectors.T, None, lambda codes: self.logits(codes).softmax(dim=-1))
 
 
 def _build_for_state(module: Classifier, state: dict[str, Any], prefix: str, *_: Any) -> None:

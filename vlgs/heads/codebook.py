@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from vlgs.heads.clusters import clusters
+from vlgs.heads.folded import Folded, fold_linear
 from vlgs.heads.rows import linear_rows
 from vlgs.values import require_range
 
@@ -71,6 +72,10 @@ class Codebook(nn.Module):
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; `predict` at unit length."""
         return normalize(self.predict(codes), dim=-1, eps=1e-6)
+
+    def fold(self) -> Folded:
+        """See `vlgs.heads.folded.Foldable`."""
+        return fold_linear(self.entries.T, None, lambda codes: codes)
 
 
 def require_width(who: str, vectors: Float[Tensor, "m e"], width: int) -> None:

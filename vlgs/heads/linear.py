@@ -4,6 +4,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.heads.folded import Folded, fold_linear
 from vlgs.heads.rows import linear_rows
 from vlgs.values import require_range
 
@@ -59,3 +60,7 @@ class Linear(nn.Module):
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; `predict` at unit length."""
         return normalize(self.predict(codes), dim=-1, eps=1e-6)
+
+    def fold(self) -> Folded:
+        """See `vlgs.heads.folded.Foldable`."""
+        return fold_linear(self.map.weight, self.map.bias, lambda codes: codes)

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from vlgs.heads.clusters import clusters
 from vlgs.heads.codebook import require_width
+from vlgs.heads.folded import Folded, fold_rows
 from vlgs.heads.rows import linear_rows
 from vlgs.values import require_range
 
@@ -82,3 +83,7 @@ class LookupTable(nn.Module):
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; one row of the table, never a mixture of several."""
         return normalize(self.table, dim=-1, eps=1e-6)[self.predict(codes).argmax(dim=-1)]
+
+    def fold(self) -> Folded:
+        """See `vlgs.heads.folded.Foldable`."""
+        return fold_rows(self.table, lambda codes: self.predict(codes).argmax(dim=-1))

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, one_hot
 
 from vlgs.heads.codebook import require_width
+from vlgs.heads.folded import Folded, fold_linear
 from vlgs.heads.rows import layers
 from vlgs.heads.threads import one_thread
 from vlgs.values import require_range
@@ -112,6 +113,10 @@ class QuantisedCodes(nn.Module):
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
         """See `Head`; the mean entry, at unit length."""
         return normalize(self.predict(codes).softmax(dim=-1) @ self.codebook, dim=-1, eps=1e-6)
+
+    def fold(self) -> Folded:
+        """See `vlgs.heads.folded.Foldable`."""
+        return fold_linear(self.codebook.T, None, lambda codes: self.predict(codes).softmax(dim=-1))
 
 
 def quantise(

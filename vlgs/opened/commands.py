@@ -40,6 +40,13 @@ def add_words(parser: argparse.ArgumentParser) -> None:
         default="{}",
         help='sentence around a word for --text, "a photo of a {}" (%(default)s)',
     )
+    parser.add_argument(
+        "--within",
+        type=float,
+        default=0.0,
+        metavar="ERROR",
+        help="by how much a cosine with a word may be off: at 0.005 many answers of one scene take a hundredth of the time (%(default)g: by rounding)",
+    )
     parser.add_argument("--threads", type=int, default=2, help="CPU threads (%(default)s)")
 
 
@@ -56,7 +63,7 @@ def opened(args: argparse.Namespace, folder: Path | None = None) -> "OpenedRun":
     from vlgs.opened.run import open_run
 
     torch.set_num_threads(args.threads)
-    run = open_run(folder or args.run, args.vocabulary, args.text, args.template)
+    run = open_run(folder or args.run, args.vocabulary, args.text, args.template, args.within)
     if run.step is not None:
         print(f"{run.path}: not finished, shown as of step {run.step}", file=sys.stderr)
     return run

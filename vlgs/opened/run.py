@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from vlgs.config import check_targets, instantiate
 from vlgs.earlier import as_today
-from vlgs.fields import NO_LANGUAGE, Field
+from vlgs.fields import NO_LANGUAGE, Field, faster
 from vlgs.fields.saved import MakePart
 from vlgs.opened.files import NamedCamera, SceneNotes, field_of, read_field, read_scene
 from vlgs.opened.words import Words
@@ -84,6 +84,7 @@ def open_run(
     vocabulary: Path | None = None,
     text: str | None = None,
     template: str = "{}",
+    within: float | None = None,
 ) -> OpenedRun:
     """Open the folder of a run, finished or still training.
 
@@ -92,6 +93,7 @@ def open_run(
         vocabulary: A file of further words and vectors (`vlgs.vocabulary` makes one).
         text: Name or folder of a CLIP or SigLIP whose text tower encodes what no vocabulary has; None: that of the run, if it had one.
         template: Sentence around words that a text tower encodes.
+        within: By how much cosines may be off, to save time (`vlgs.fields.faster`); None: as scores are made.
 
     Raises:
         ValueError: If it is no run folder, has nothing to show yet, or is of another version.
@@ -104,6 +106,7 @@ def open_run(
     config = _config(path)
     notes = read_scene(run)
     field, step = _field(run, partial(_make, config))
+    field = field if within is None else faster(field, within)
     known = Words.of(notes.vocabulary, config.text, vocabulary, text, template)
     return OpenedRun(path, field, notes, instantiate(config.query), known, step)
 

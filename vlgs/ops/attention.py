@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import array_list, arrays
 from vlgs.ops.device import Kernels
 
 
@@ -48,9 +49,9 @@ class _Attention(torch.autograd.Function):
         color, feature, *layers = tensors
         out_color = torch.empty_like(color) if mixes_color else None
         out_feature = torch.empty_like(feature)
-        threads = torch.get_num_threads()
         _csrc.attention(
-            color, feature, layers, token.heads, token.width, mixes_color, out_color, out_feature, threads,
+            *arrays(color, feature), array_list(layers), token.heads, token.width, mixes_color,
+            *arrays(out_color, out_feature), torch.get_num_threads(),
         )  # fmt: skip
         ctx.save_for_backward(*tensors)
         ctx.token, ctx.mixes_color = token, mixes_color
@@ -62,10 +63,10 @@ class _Attention(torch.autograd.Function):
         color, feature, *layers = ctx.saved_tensors
         d_color, d_feature, *d_layers = (torch.empty_like(t) for t in ctx.saved_tensors)
         *d_out_color, d_out_feature = (d.contiguous() for d in grad_outputs)
+        given = d_out_color[0] if d_out_color else None, d_out_feature
         _csrc.attention_backward(
-            color, feature, layers, ctx.token.heads, ctx.token.width, ctx.mixes_color,
-            d_out_color[0] if d_out_color else None,
-            d_out_feature, d_color, d_feature, d_layers, torch.get_num_threads(),
+            *arrays(color, feature), array_list(layers), ctx.token.heads, ctx.token.width, ctx.mixes_color,
+            *arrays(*given, d_color, d_feature), array_list(d_layers), torch.get_num_threads(),
         )  # fmt: skip
         return (None, None, d_color, d_feature, *d_layers)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 from vlgs.ops.project import Splats, project
 from vlgs.ops.rasterize_to_pixels import weights_alone
@@ -154,7 +155,7 @@ class _Product(torch.autograd.Function):
     ):
         values = values.contiguous()
         image = values.new_empty(*size, values.shape[1])
-        weights.render(values, image, torch.get_num_threads())
+        weights.render(*arrays(values, image), torch.get_num_threads())
         ctx.weights, ctx.like = weights, values.shape
         return image
 
@@ -163,7 +164,7 @@ class _Product(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         d_image = grad_outputs[0].contiguous()
         d_values = d_image.new_empty(ctx.like)
-        ctx.weights.backward(d_image, d_values, torch.get_num_threads())
+        ctx.weights.backward(*arrays(d_image, d_values), torch.get_num_threads())
         return d_values, None, None
 
 

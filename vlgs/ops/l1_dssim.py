@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 from vlgs.ops.ssim import FLOORS, taps
 
@@ -30,7 +31,7 @@ class _L1Dssim(torch.autograd.Function):
         render, image = render.contiguous(), image.contiguous()
         valid = None if valid is None else valid.contiguous()
         distance, dissimilarity, count = _csrc.ssim_sums(
-            render, image, valid, taps(render.dtype), FLOORS, torch.get_num_threads()
+            *arrays(render, image, valid, taps(render.dtype)), FLOORS, torch.get_num_threads()
         )
         ctx.save_for_backward(render, image, valid)
         ctx.l1_share, ctx.numbers = l1_share, max(count * render.shape[-1], 1)
@@ -45,8 +46,8 @@ class _L1Dssim(torch.autograd.Function):
         d_image = torch.empty_like(image) if ctx.needs_input_grad[1] else None
         scale = d_loss.item() / ctx.numbers
         _csrc.ssim_sums_backward(
-            render, image, valid, taps(render.dtype), FLOORS,
-            ctx.l1_share * scale, (1 - ctx.l1_share) * scale, d_render, d_image, torch.get_num_threads(),
+            *arrays(render, image, valid, taps(render.dtype)), FLOORS,
+            ctx.l1_share * scale, (1 - ctx.l1_share) * scale, *arrays(d_render, d_image), torch.get_num_threads(),
         )  # fmt: skip
         return d_render, d_image, None, None
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels, differentiated
 from vlgs.types import Camera, RasterConfig
 
@@ -49,10 +50,8 @@ def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: _csrc.Camera)
     """The fields of `Splats`."""
     mean2d, ellipse = means.new_empty(len(means), 2), means.new_empty(len(means), 3)
     depth = means.new_empty(len(means))
-    _csrc.project(
-        camera, means.contiguous(), quats.contiguous(), scales.contiguous(),
-        mean2d, ellipse, depth, torch.get_num_threads(),
-    )  # fmt: skip
+    given = means.contiguous(), quats.contiguous(), scales.contiguous()
+    _csrc.project(camera, *arrays(*given, mean2d, ellipse, depth), torch.get_num_threads())
     return mean2d, ellipse, depth
 
 
@@ -74,8 +73,8 @@ class _Project(torch.autograd.Function):
         means, quats, scales, depth = ctx.saved_tensors
         grads = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
         upstream = grad_outputs[0].contiguous(), grad_outputs[1].contiguous()
-        threads = torch.get_num_threads()
-        _csrc.project_backward(ctx.camera, means, quats, scales, depth, *upstream, *grads, threads)
+        tensors = (means, quats, scales, depth, *upstream, *grads)
+        _csrc.project_backward(ctx.camera, *arrays(*tensors), torch.get_num_threads())
         return (*grads, None)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import array_list, arrays
 from vlgs.ops.device import Kernels, differentiated
 from vlgs.ops.project import Splats
 from vlgs.types import Camera, ChannelGroup, RasterConfig, Rendered
@@ -111,8 +112,8 @@ def _rasterize(layout: _Layout, keep: bool, *tensors: Tensor):
     images = [depth.new_empty(*size, v.shape[1]) for v in values]
     kernel = _csrc.RasterizedFloat if depth.dtype == torch.float32 else _csrc.RasterizedDouble
     picture = kernel(
-        mean2d, ellipse, depth, weights, layout.shape_grads, values, layout.order, layout.chain_of,
-        layout.config, images, alphas, visible, keep, torch.get_num_threads(),
+        *arrays(mean2d, ellipse, depth), array_list(weights), layout.shape_grads, array_list(values), layout.order,
+        layout.chain_of, layout.config, array_list(images), array_list(alphas), *arrays(visible), keep, torch.get_num_threads(),
     )  # fmt: skip
     return picture, (visible, *alphas, *images)
 
@@ -143,9 +144,10 @@ class _RasterizeToPixels(torch.autograd.Function):
         needs = (needs_mean2d, needs_ellipse, *needs_rest)
         grads = [torch.empty_like(t) if n else None for t, n in zip(saved, needs, strict=True)]
         d_mean2d, d_ellipse, *d_rest = grads
+        values, d_images = saved[2 + num_chains :], d_pictures[num_chains:]
         ctx.picture.backward(
-            saved[2 + num_chains :], d_pictures[num_chains:], d_pictures[:num_chains],
-            d_mean2d, d_ellipse, d_rest[:num_chains], d_rest[num_chains:], torch.get_num_threads(),
+            array_list(values), array_list(d_images), array_list(d_pictures[:num_chains]),
+            *arrays(d_mean2d, d_ellipse), array_list(d_rest[:num_chains]), array_list(d_rest[num_chains:]), torch.get_num_threads(),
         )  # fmt: skip
         return (None, d_mean2d, d_ellipse, None, *d_rest)
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 
 Pixels = Literal["valid", "all"]
@@ -31,7 +32,7 @@ class _SquaredError(torch.autograd.Function):
     def forward(ctx: Any, render: Tensor, target: Tensor, valid: Tensor | None, pixels: Pixels):
         render, target = render.contiguous(), target.contiguous()
         valid = None if valid is None else valid.contiguous()
-        total, count = _csrc.squared_error(render, target, valid, torch.get_num_threads())
+        total, count = _csrc.squared_error(*arrays(render, target, valid), torch.get_num_threads())
         ctx.save_for_backward(render, target, valid)
         ctx.numbers = max(render.numel() if pixels == "all" else count * render.shape[-1], 1)
         return render.new_tensor(total / ctx.numbers)
@@ -42,8 +43,8 @@ class _SquaredError(torch.autograd.Function):
         render, target, valid = ctx.saved_tensors
         d_render = torch.empty_like(render)
         scale = 2 * d_loss.item() / ctx.numbers
-        threads = torch.get_num_threads()
-        _csrc.squared_error_backward(render, target, valid, scale, d_render, threads)
+        given, threads = arrays(render, target, valid), torch.get_num_threads()
+        _csrc.squared_error_backward(*given, scale, *arrays(d_render), threads)
         return d_render, -d_render if ctx.needs_input_grad[1] else None, None, None
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vlgs import _csrc
+from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 
 
@@ -58,7 +59,7 @@ class _ViewColor(torch.autograd.Function):
     def forward(ctx: Any, color: Tensor, shN: Tensor, means: Tensor, eye: list[float], degree: int):
         tensors = color.contiguous(), shN.contiguous(), means.contiguous()
         out = torch.empty_like(tensors[0])
-        _csrc.view_color(*tensors, eye, degree, out, torch.get_num_threads())
+        _csrc.view_color(*arrays(*tensors), eye, degree, *arrays(out), torch.get_num_threads())
         ctx.save_for_backward(*tensors)
         ctx.eye, ctx.degree = eye, degree
         return out
@@ -67,12 +68,11 @@ class _ViewColor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, d_out: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         color, shN, means = ctx.saved_tensors
-        d_color, d_shN, d_means = (torch.empty_like(t) for t in ctx.saved_tensors)
+        grads = torch.empty_like(color), torch.empty_like(shN), torch.empty_like(means)
         _csrc.view_color_backward(
-            color, shN, means, ctx.eye, ctx.degree, d_out.contiguous(), d_color, d_shN, d_means,
-            torch.get_num_threads(),
+            *arrays(color, shN, means), ctx.eye, ctx.degree, *arrays(d_out.contiguous(), *grads), torch.get_num_threads()
         )  # fmt: skip
-        return d_color, d_shN, d_means, None, None
+        return (*grads, None, None)
 
 
 def _on_cpu(color: Tensor, shN: Tensor, means: Tensor, eye: Tensor, degree: int) -> Tensor:

@@ -42,6 +42,8 @@ class Densification(AfterStep):
         ):
             camera = module.views.scene.train[index].camera
             state.accumulate(gradient, render.visible, camera.width, camera.height)
+        if done == module.settings.iterations:
+            return  # no iteration would train what comes, or bring back what is made transparent
         if config.densify.densifies_at(done):
             densify(
                 module.model.splats,

@@ -11,6 +11,7 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.loggers import Logger
 
+from vlgs.ops.machine import freed_memory_kept
 from vlgs.runs import RunFolder
 from vlgs.training.after_step import TrainedModule
 from vlgs.training.callbacks import (
@@ -108,7 +109,7 @@ def train_on(
     if options.progress:
         callbacks.append(ProgressLine())
     callbacks += options.callbacks
-    with _expected_warnings():
+    with _expected_warnings(), freed_memory_kept():
         _trainer(folder, callbacks, options).fit(module, train_dataloaders=steps)
     return stop.stopped_by
 

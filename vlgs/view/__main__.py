@@ -100,7 +100,8 @@ def serve(shown: list["Shown"], args: argparse.Namespace) -> None:
     from vlgs.view.server import Address, Server
     from vlgs.view.watch import Watch
 
-    words = {"vocabulary": args.vocabulary, "text": args.text, "template": args.template}
+    names = ("vocabulary", "text", "template", "within")
+    words = {name: getattr(args, name) for name in names}
     watch = Watch(shown, partial(open_run, **words))
     server = Server(shown, Address(args.host, args.port), args.word)
     try:

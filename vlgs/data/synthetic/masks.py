@@ -13,7 +13,7 @@ Levels of one photograph do not err independently: what a segmenter overlooks, o
 any granularity. A part or a patch has the fate of the whole thing that it is of, at the rate `LabelNoise.shared`, and otherwise one of its own.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,9 @@ _SMALLEST = 5e-4  # share of the image below which a region gets no mask
 _FIELD_CELL = 6  # pixels between the knots of the border displacement
 _FATES, _NOISE, _BORDERS, _LAYING, _SHARED = range(5)  # purposes of draws
 _WHOLE = 3
+
+Describe = Callable[[str, str, int, float, np.random.Generator], Float[np.ndarray, " e"]]
+"""Class, piece, level, length of noise and what draws it, to the unit vector of a mask: `vlgs.data.synthetic.language.mask_vector`."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class LevelMasks:
 
     index: Int[np.ndarray, "h w"]
     """Row of `vectors` per pixel, -1 where no mask lies; int32."""
-    vectors: Float[np.ndarray, "m 512"]
+    vectors: Float[np.ndarray, "m e"]
     """Unit length; every row covers at least one pixel. float32."""
 
 
@@ -96,6 +99,8 @@ def view_masks(
     words: tuple[str, ...],
     faults: LabelNoise,
     key: tuple[int, ...],
+    describe: Describe = mask_vector,
+    width: int = WIDTH,
 ) -> tuple[LevelMasks, LevelMasks, LevelMasks, LevelMasks]:
     """Supervision of one view at levels 0, 1, 2 and 3; `level_masks` makes one of them alone.
 
@@ -105,10 +110,23 @@ def view_masks(
         words: Classes that a mask may be mislabelled as.
         faults: Resolved rates.
         key: Seed, scene and number of the view: what the draws are functions of, besides the mask.
+        describe: What gives a mask its vector.
+        width: Of these.
     """
-    subpart, part, whole = (
-        level_masks(regions, names, words, faults, key, level) for level in LEVELS
-    )
+    levels = {
+        level: _level_masks(
+            regions[level],
+            regions[_WHOLE],
+            names[level],
+            words,
+            faults,
+            (*key, level),
+            describe,
+            width,
+        )
+        for level in LEVELS
+    }
+    whole, part, subpart = levels[3], levels[2], levels[1]
     index, offset = whole.index, whole.vectors.shape[0]
     for level, finer in ((2, part), (1, subpart)):
         rng = np.random.default_rng([_LAYING, *key, level])
@@ -134,7 +152,7 @@ def level_masks(
     if level == 0:
         return view_masks(regions, names, words, faults, key)[0]
     own, wholes = regions[level], regions[_WHOLE]
-    return _level_masks(own, wholes, names[level], words, faults, (*key, level))
+    return _level_masks(own, wholes, names[level], words, faults, (*key, level), mask_vector, WIDTH)
 
 
 def _level_masks(
@@ -144,6 +162,8 @@ def _level_masks(
     words: tuple[str, ...],
     faults: LabelNoise,
     key: tuple[int, ...],
+    describe: Describe,
+    width: int,
 ) -> LevelMasks:
     ragged = _displace(regions, faults.ragged or 0.0, np.random.default_rng([_BORDERS, *key]))
     numbers, local = np.unique(ragged, return_inverse=True)
@@ -162,13 +182,13 @@ def _level_masks(
     )  # others are nothing that could be found
     group = _merge(local, present, fate == 1, draws[:, 1])
 
-    vectors = np.zeros((numbers.size, WIDTH))
+    vectors = np.zeros((numbers.size, width))
     for i in np.flatnonzero(present):
         region = names[int(numbers[i])]
         others = [w for w in words if w != region.word]
         word = others[int(draws[i, 2] * len(others))] if fate[i] == 2 and others else region.word
         rng = np.random.default_rng([_NOISE, *key, int(numbers[i])])
-        vector = mask_vector(word, region.piece, key[-1], faults.noise or 0.0, rng)
+        vector = describe(word, region.piece, key[-1], faults.noise or 0.0, rng)
         vectors[group[i]] += areas[i] * vector
     masks = np.unique(group[present])
     rows = np.full(numbers.size, -1, np.int32)
