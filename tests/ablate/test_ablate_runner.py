@@ -157,6 +157,7 @@ def test_ctrl_c_lets_the_runs_save_and_the_same_command_goes_on(table: Table, tm
         read_outcome(folder, 0) for folder in (results / "logs").iterdir() if folder.is_dir()
     ]
     assert outcome.status == STOPPED  # it was told, and saved
+    assert not list((results / "logs").rglob("0001*"))  # nor looked at
     assert ablate(request_of(table, results)) == 0
 
 

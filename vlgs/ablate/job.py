@@ -80,6 +80,10 @@ def read_outcome(folder: Path, number: int) -> JobOutcome:
     return replace(outcome, log=str(folder / outcome.log))
 
 
+class StoppedJobs(BaseException):
+    """The jobs that are left shall not be looked at."""
+
+
 def run_job(config: DictConfig) -> None:
     """What a Hydra launcher calls: run the overrides of this job."""
     _run_job(warm=False)
@@ -92,7 +96,10 @@ def run_warm_job(config: DictConfig) -> None:
 
 def _run_job(warm: bool) -> None:
     hydra = HydraConfig.get()
-    run_and_record(Path(hydra.sweep.dir), int(hydra.job.num), list(hydra.overrides.task), warm)
+    folder = Path(hydra.sweep.dir)
+    run_and_record(folder, int(hydra.job.num), list(hydra.overrides.task), warm)
+    if (folder / STOP).exists() and hydra.launcher._target_.endswith("BasicLauncher"):
+        raise StoppedJobs  # it would compose one configuration after the other: half a minute for a hundred jobs
 
 
 def run_and_record(folder: Path, number: int, overrides: Sequence[str], warm: bool = False) -> None:

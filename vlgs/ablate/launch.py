@@ -13,7 +13,14 @@ from hydra.core.utils import JobStatus
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 
-from vlgs.ablate.job import JobOutcome, leave_parent, read_outcome, run_job, run_warm_job
+from vlgs.ablate.job import (
+    JobOutcome,
+    StoppedJobs,
+    leave_parent,
+    read_outcome,
+    run_job,
+    run_warm_job,
+)
 from vlgs.config import CONF, quote_override
 
 log = logging.getLogger(__name__)
@@ -78,6 +85,8 @@ def launch(
             for done in launcher.launch(jobs, initial_job_idx=first):
                 if done.status == JobStatus.FAILED:  # before its run began: no disk, no module
                     trouble = done._return_value
+        except StoppedJobs:
+            log.debug("stopped")
         except Exception as error:  # launchers are other people's code: every one has errors of its own for a lost worker
             trouble = error
         finally:

@@ -164,8 +164,10 @@ def threads(parser: ArgumentParser) -> Runner:
 
         from vlgs.bench.threads import measure_threads, show_threads
 
-        size, repeats = ((500, 64, 48), 2) if args.quick else (args.size, args.repeats)
-        Console().print(show_threads(measure_threads(*size, args.threads, repeats)))
+        (n, width, height), repeats = (
+            ((500, 64, 48), 2) if args.quick else (args.size, args.repeats)
+        )
+        Console().print(show_threads(measure_threads(n, width, height, args.threads, repeats)))
         return 0
 
     return run
