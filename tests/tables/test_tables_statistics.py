@@ -209,8 +209,10 @@ def test_the_order_in_which_runs_are_read_moves_no_interval(tmp_path: Path):
     assert [claim.here for claim in other] == [claim.here for claim in one]
 
 
-def test_a_group_on_other_data_is_compared_with_its_own_full_model(tmp_path: Path):
-    other = "data.faults.noise=0"
+@pytest.mark.parametrize("other", ["data.faults.noise=0", "trainer.iterations=2500"])
+def test_a_group_on_other_data_or_budget_is_compared_with_its_own_full_model(
+    tmp_path: Path, other: str
+):
     more = f"""
   - {{label: Worse, group: Clean, set: [fusion=none, {other}]}}
   - {{label: Clean full, group: Clean, set: [{other}]}}

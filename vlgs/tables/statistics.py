@@ -26,6 +26,9 @@ Verdict = Literal["holds", "reversed", "above", "below", "equivalent", "cannot b
 """``holds`` and ``reversed`` are of the paper's sign, ``above`` and ``below`` 0 where it gives none, ``equivalent`` within the margin of the
 quantity. ``no claim``: too few seeds."""
 
+_SETTING = ("data.", "trainer.iterations=")
+"""Overrides of which a row may have any and still be the full model: they say where and how long it is trained."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -250,14 +253,14 @@ def full_model(rows: Sequence[Row], group: str) -> int | None:
     """Row that a group's rows are compared with."""
     full = [i for i, row in enumerate(rows) if row.overrides == ()]
     own = [i for i in full if rows[i].group == group]
-    # A group on other data has a full model of its own: the row that changes nothing but the data.
+    # A group on other data, or of another budget, has a full model of its own: the row that changes nothing else.
     moved = [
         i
         for i, row in enumerate(rows)
         if group
         and row.group == group
         and row.overrides
-        and all(word.startswith("data.") for word in row.overrides)
+        and all(word.startswith(_SETTING) for word in row.overrides)
     ]
     return (own or moved or full or [None])[0]
 
