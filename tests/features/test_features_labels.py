@@ -130,7 +130,7 @@ def test_a_labelled_scene_becomes_one_that_training_reads(tmp_path: Path):
     add_dense(root, write_scene(root))
     words = tmp_path / "words.npz"
     write_words(words, ("glass", "wall"))
-    given = (f"data.root={root}", "features=labels", f"features.extractor.vocabulary={words}")
+    given = (f"data.root={root}", "features=labels", f"features.extractor.words={words}")
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("features", overrides=[*given, "progress=false"])
     assert isinstance(instantiate(config.features.extractor), LabelMasks)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils.dlpack import from_dlpack
 
 from tests import fuzz_kernel as fuzz
 from tests.fuzz_kernel import run_scene
@@ -102,6 +103,7 @@ squared_error, squared_error_backward = _csrc.squared_error, _csrc.squared_error
 
 
 def reads_everything(a: Any, b: Any, valid: Any, threads: int) -> tuple[float, int]:
+    a, b = from_dlpack(a), from_dlpack(b)  # a capsule is good for one call
     return squared_error(a, b, None, threads)[0], squared_error(a, b, valid, threads)[1]
 
 

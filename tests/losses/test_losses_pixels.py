@@ -44,7 +44,7 @@ def test_absolute_error_is_that_of_torch_bit_for_bit(rows: int):
     found = []
     for error in (masked_l1, l1_loss):
         sides = [render.clone().requires_grad_(), target.clone().requires_grad_()]
-        loss = 0.37 * error(*sides)
+        loss = 0.37 * error(sides[0], sides[1])
         found.append([loss.detach(), *torch.autograd.grad(loss, sides)])
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=0, equal_nan=True)
 

@@ -34,14 +34,19 @@ def test_a_word_is_answered_in_pictures_and_json(
     bounds = ranges(opened.field, [*cameras.values()], asked)
     row = answers[0]
     found = ask_view(opened.field, cameras[row["view"]], asked)
-    assert row["score"] == found.score(0)
-    assert row["scores"] == {"3": found.score(0)}
+    # Commands leave out the last step of the head: what is decoded here differs by rounding.
+    off = 5e-6
+    assert row["score"] == pytest.approx(found.score(0), abs=off)
+    assert row["scores"] == {"3": row["score"]}
     x, y = row["peak"]
-    assert found.relevancy[0, 0, y, x] == found.relevancy[0, 0].max()
-    mask = np.asarray(Image.open(row["files"]["mask"]))
-    expected = found.relevancy[0, 0] > bounds[0].threshold()
-    assert (mask[..., 0] > 0).tolist() == expected.tolist()
-    assert row["share"] == pytest.approx(float(expected.float().mean()))
+    highest = float(found.relevancy[0, 0].max())
+    assert float(found.relevancy[0, 0, y, x]) == pytest.approx(highest, abs=off)
+    mask = np.asarray(Image.open(row["files"]["mask"]))[..., 0] > 0
+    above = found.relevancy[0, 0] - bounds[0].threshold()
+    sure = (above.abs() > off).numpy()
+    assert sure.mean() > 0.9
+    assert (mask == (above > 0).numpy())[sure].all()
+    assert row["share"] == pytest.approx(mask.mean())
     assert sorted(path.name.split("_")[-1] for path in (tmp_path / "mug").iterdir()) == sorted(
         ["heat.png", "mask.png", "overlay.png"] * 2
     )

@@ -57,6 +57,7 @@ from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import rasterize_reference
 from vlgs.ops import ssim as ops_ssim
+from vlgs.ops.absolute_error import absolute_error
 from vlgs.ops.attention import Token, attend
 from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.depth import at_rows, camera_depth, render_depth
@@ -374,6 +375,9 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.ops.attention.attend": lambda: (
         lambda color, feature, *layers: attend(color, feature, Token(1, 2), layers, True),
         [draw(3, 2), draw(3, 1, seed=1), *(draw(*s, seed=i) for i, s in enumerate(LAYERS))],
+    ),
+    "vlgs.ops.absolute_error.absolute_error": lambda: (
+        absolute_error, [torch.rand(4, 5, 3, dtype=torch.float64), 2 + torch.rand(4, 5, 3, dtype=torch.float64)]
     ),
     "vlgs.ops.squared_error.squared_error": lambda: both(squared_error, VALID, "all"),
     "vlgs.ops.ssim.ssim_map": lambda: (ops_ssim.ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),

@@ -70,7 +70,7 @@ def test_a_port_in_use_is_refused(folder: Path):
 def test_the_first_picture_needs_no_browser_and_no_server(folder: Path, tmp_path: Path):
     out = tmp_path / "first.png"
     main([str(folder), "--word", "mug", "--picture", str(out)])
-    shown = Shown(open_run(folder))
+    shown = Shown(open_run(folder, within=0.0))
     shown.learn("mug")
     want = first_picture([shown], "mug").pixels
     assert torch.equal(torch.from_numpy(np.asarray(Image.open(out)).copy()), want)

@@ -29,7 +29,7 @@ from vlgs.data.views import ViewSource
 from vlgs.features.extractor import Extractor
 from vlgs.features.folder import FeatureFolder, pair_bytes
 
-_NO_NUMBER_MOVES = frozenset({"weights", "device", "batch", "labels", "vocabulary"})
+_NO_NUMBER_MOVES = frozenset({"weights", "device", "batch", "labels", "words"})
 """Keys of an extractor that are not part of the settings of a folder: speed, and places whose content `identity` has."""
 
 _VERSION = 1

@@ -35,20 +35,20 @@ class LabelMasks:
 
     Args:
         labels: Folder of ``classes.json`` and ``<stem>.png``.
-        vocabulary: Text vectors, as `data.vocabulary`: one for each class, spelled as there.
+        words: File of text vectors, as `data.vocabulary`: one for each class, spelled as there.
         noise: Rates of errors; what is None is that of hard procedural scenes.
         seed: Of the errors.
 
     Raises:
-        FileNotFoundError: If labels or vocabulary are not there.
+        FileNotFoundError: If labels or words are not there.
         SceneError: If one of them is at fault.
-        ValueError: If labels are not dense, the vocabulary lacks one of their classes, or `seed` is negative.
+        ValueError: If labels are not dense, words lack one of their classes, or `seed` is negative.
     """
 
     def __init__(
         self,
         labels: str,
-        vocabulary: str,
+        words: str,
         noise: LabelNoise = LabelNoise(),  # noqa: B008 (frozen)
         seed: int = 0,
     ):
@@ -64,14 +64,14 @@ class LabelMasks:
             raise ValueError(
                 f"features: labels must be a class for each pixel (classes.json and <stem>.png), got others in {labels}"
             )
-        known = read_vocabulary(Path(vocabulary))
+        known = read_vocabulary(Path(words))
         lacking = [name for name in folder.classes if name not in known.names]
         if lacking:
             raise ValueError(
-                f"features: vocabulary must have a vector for every class of {labels}, got none for {', '.join(lacking[:5])} in {vocabulary}"
+                f"features: words must have a vector for every class of {labels}, got none for {', '.join(lacking[:5])} in {words}"
             )
         rows = [known.names.index(name) for name in folder.classes]
-        self.files = (labels, vocabulary)
+        self.files = (labels, words)
         self.labels = folder
         self.noise = noise.resolve("hard")
         self.seed = seed
@@ -79,11 +79,11 @@ class LabelMasks:
         self._gap, self._meanings = _directions(self.text)
 
     def identity(self) -> Mapping[str, str]:
-        """Hashes of the labels and of the vocabulary."""
-        labels, vocabulary = self.files
+        """Hashes of the labels and of the words."""
+        labels, words = self.files
         return {
             "labels": folder_digest(labels, "features.extractor.labels"),
-            "vocabulary": file_digest(vocabulary, "features.extractor.vocabulary"),
+            "words": file_digest(words, "features.extractor.words"),
         }
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], stem: str) -> MaskFeatures:

@@ -186,7 +186,7 @@ def faster(field: Field, within: float = 0.0) -> Field:
         ValueError: If the bound is not in [0, 2].
     """
     require_range("faster", 0, 2, within=within)
-    return field.faster(within) if isinstance(field, HasFaster) else field
+    return field.faster(within) if field.has_language and isinstance(field, HasFaster) else field
 
 
 def require_outputs(who: str, outputs: Iterable[str], had: frozenset[str]) -> None:
