@@ -14,7 +14,7 @@ INTERVAL = re.compile(rf"{NUMBER}(?: dB)?\s+\[{NUMBER}, {NUMBER}\]")
 def claimed(folder: Path) -> set[tuple[str, ...]]:
     """Difference and interval of every claim, as a document rounds them."""
     found = set()
-    for path in folder.glob("*-claims.csv"):
+    for path in folder.rglob("*-claims.csv"):
         lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
         for row in csv.DictReader(lines):
             if row["low"]:
@@ -23,7 +23,7 @@ def claimed(folder: Path) -> set[tuple[str, ...]]:
     return found
 
 
-@pytest.mark.parametrize("name", ["synthetic", "camvid"])
+@pytest.mark.parametrize("name", ["synthetic", "camvid", "verdicts"])
 def test_every_interval_of_a_document_stands_in_a_table(name: str):
     known = claimed(RESULTS / name)
     said = INTERVAL.findall((RESULTS / name / "README.md").read_text())
