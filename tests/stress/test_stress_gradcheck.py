@@ -8,21 +8,18 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd import gradcheck
 
+from tests.stress.draws import Check, draw
+from tests.stress.gradients_of_heads import HEAD_CHECKS
+from tests.stress.gradients_of_rays import RAY_CHECKS
 from tests.stress.no_gradient import AREAS, NO_GRADIENT, public_functions
 from tests.stress.splats import SMOOTH, make_splats
-from vlgs.fields.hash_grid import GridConfig, HashGrid, contract, interpolate
-from vlgs.fields.language_field import LanguageConfig, LanguageField
-from vlgs.fields.nerf import along
-from vlgs.fields.radiance import Frame, RadianceConfig, RadianceField, Samples, harmonics, in_cube
-from vlgs.fields.rays import Rays, Spacing, ray_depth, ray_weights, spread
 from vlgs.fields.similarity import cosines, decoded_cosines
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.attention import CrossAttention, SelfAttention
@@ -34,14 +31,7 @@ from vlgs.gaussians.parameters import activate
 from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.gsplat import rasterization
-from vlgs.heads.autoencoder import Autoencoder
-from vlgs.heads.classifier import Classifier
-from vlgs.heads.codebook import Codebook
 from vlgs.heads.identity import Identity
-from vlgs.heads.linear import Linear
-from vlgs.heads.lookup import LookupTable
-from vlgs.heads.quantised import QuantisedCodes, quantiser_loss
-from vlgs.heads.rows import layers, linear_rows
 from vlgs.indicator import Learned, Opacity, PerLevel
 from vlgs.losses import (
     l1_dssim,
@@ -51,9 +41,7 @@ from vlgs.losses import (
     ssim,
     ssim_map,
 )
-from vlgs.objectives import CodebookLanguage, CodeClasses, Language, LookupLanguage
-from vlgs.objectives.lookup import choice_error
-from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
+from vlgs.objectives import Language
 from vlgs.ops import l1_dssim as ops_l1_dssim
 from vlgs.ops import rasterize_reference
 from vlgs.ops import ssim as ops_ssim
@@ -68,14 +56,6 @@ from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.types import Camera, ChannelGroup, DepthKind, Gaussians, RasterConfig
 from vlgs.view_blend import FixedBlend, blend_targets
 from vlgs.view_blend.pose import slerp
-
-Check = tuple[Callable[..., object], list[Tensor]]
-
-
-def draw(*shape: int, seed: int = 0, low: float = -1.0, high: float = 1.0) -> Tensor:
-    rng = torch.Generator().manual_seed(seed)
-    return torch.rand(*shape, generator=rng, dtype=torch.float64) * (high - low) + low
-
 
 VALID = torch.tensor([[True, False, True, True]] * 3)
 SIZE = (3, 4, 2)
@@ -225,123 +205,17 @@ def fuse(module: torch.nn.Module) -> Check:
     return run, [draw(3, 2), draw(3, 2, seed=1), *(p.detach() for p in module.parameters())]
 
 
-def linear_head(name: str) -> Check:
-    """By codes, weights and biases."""
-    made = Linear(dim=3, width=4).double()
-    del made.map  # its weights are inputs here
-
-    def run(x: Tensor, weight: Tensor, bias: Tensor):
-        made.__dict__["map"] = SimpleNamespace(weight=weight, bias=bias)
-        return getattr(made, name)(x)
-
-    return run, [draw(2, 3, 3), draw(4, 3, seed=1), draw(4, seed=2)]
-
-
-def bound(objective: Any, head: nn.Module) -> Any:
-    """An objective that sees five masks and a head in float64."""
-    masks = SimpleNamespace(codes_of=lambda rows: draw(5, 4, seed=5)[rows])
-    objective.head, objective.views = head.double(), masks
-    return objective
-
-
-def codebook(name: str) -> Check:
-    """By codes and entries."""
-    made = Codebook(dim=3, width=4).double()
-    del made.entries  # they are an input here
-
-    def run(codes: Tensor, entries: Tensor):
-        made.__dict__["entries"] = entries
-        if name == "total":
-            return bound(CodebookLanguage(), made).total(codes, torch.tensor([0, 3, 0, 1, 4, 1]))
-        return getattr(made, name)(codes)
-
-    return run, [draw(6, 3), draw(3, 4, seed=1)]
-
-
-def head() -> Autoencoder:
-    made = Autoencoder(dim=3, encoder_widths=(8, 6), decoder_widths=(6, 8))
-    torch.manual_seed(0)
-    made.build(5)
-    made.requires_grad_(False)
-    return made.double()
-
-
-def classifier() -> Classifier:
-    made = Classifier(dim=2)
-    made.fit(draw(3, 4).float(), torch.ones(3))
-    return made.double()
-
-
-def lookup() -> LookupTable:
-    torch.manual_seed(0)
-    made = LookupTable(dim=2, rows=3, width=4)
-    made.fit(draw(3, 4).float(), torch.ones(3))
-    return made
-
-
-def quantised() -> QuantisedCodes:
-    torch.manual_seed(0)
-    made = QuantisedCodes(dim=2, entries=3, width=4, hidden=[5])
-    made.codebook = draw(3, 4)
-    return made.double()
-
-
 def both(loss: Callable[..., Tensor], *rest: object) -> Check:
     """A loss as a function of the render; the target differs from it everywhere."""
     return lambda render: loss(render, 2 + draw(*SIZE, seed=9), *rest), [draw(*SIZE)]
 
 
 rotation = quat_to_rotmat(draw(4, 4, seed=4))
-GRID = GridConfig(levels=2, features=2, coarsest=2, finest=4, log2_table=5)
-PLACES = draw(3, 3, seed=7, low=0.1, high=0.9)
-RAYS = Rays(draw(2, 3, seed=8), torch.nn.functional.normalize(draw(2, 3, seed=9), dim=1))
-
-
-def by_table(function: Callable[[HashGrid], Tensor]) -> Check:
-    """By all features of a hash grid."""
-    grid = HashGrid(GRID).double()
-    return by_parameters(grid, lambda: function(grid))
-
-
-def radiance() -> RadianceField:
-    frame = Frame(torch.zeros(3).double(), 1.0, Spacing(0.1, 2.0), torch.zeros(0, 3))
-    config = RadianceConfig(GRID, width=3, coarse=4, samples=3, cells=4)
-    return RadianceField(config, frame, torch.Generator().manual_seed(0)).double()
-
-
-def by_radiance(function: Callable[[RadianceField, Samples], object]) -> Check:
-    field = radiance()
-    samples = field.sample(RAYS)
-    return by_parameters(field, lambda: function(field, samples))
-
-
-def by_language(function: Callable[[LanguageField, Tensor], Tensor]) -> Check:
-    config = LanguageConfig([GRID], hidden=1, width=3, half=False)
-    field = LanguageField(config, 4, 2, torch.Generator().manual_seed(0)).double()
-    return by_parameters(field, lambda: function(field, draw(3, GRID.width)))
-
-
-def by_parameters(module: torch.nn.Module, function: Callable[[], object]) -> Check:
-    """By all weights of a module; draws of size 1 in place of its initial ones, which are near a kink of ReLU."""
-    names = [name for name, _ in module.named_parameters()]
-    values = [draw(*p.shape, seed=i) for i, p in enumerate(module.parameters())]
-
-    class Called(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = module
-
-        def forward(self) -> object:
-            return function()
-
-    def call(*given: Tensor) -> object:
-        state = {f"inner.{name}": value for name, value in zip(names, given, strict=True)}
-        return torch.func.functional_call(Called(), state, ())
-
-    return call, values
 
 
 CHECKS: dict[str, Callable[[], Check]] = {
+    **HEAD_CHECKS,
+    **RAY_CHECKS,
     "vlgs.ops.rasterize.rasterize": lambda: rasterizing("cpu", False),
     "vlgs.ops.rasterize.rasterize outside the clamp": lambda: rasterizing("cpu", True),
     "vlgs.ops.rasterize.rasterize shape_grad off": shape_alone,
@@ -377,7 +251,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
         [draw(3, 2), draw(3, 1, seed=1), *(draw(*s, seed=i) for i, s in enumerate(LAYERS))],
     ),
     "vlgs.ops.absolute_error.absolute_error": lambda: (
-        absolute_error, [torch.rand(4, 5, 3, dtype=torch.float64), 2 + torch.rand(4, 5, 3, dtype=torch.float64)]
+        absolute_error, [draw(*SIZE), 2 + draw(*SIZE, seed=1)]
     ),
     "vlgs.ops.squared_error.squared_error": lambda: both(squared_error, VALID, "all"),
     "vlgs.ops.ssim.ssim_map": lambda: (ops_ssim.ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),
@@ -421,45 +295,6 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.gaussians.attributes.Attribute.activate of sparse codes": lambda: (
         replace(STANDARD["features"], activation="sparse", kept=2, parts=2).activate, [draw(4, 8)]
     ),
-    "vlgs.heads.rows.linear_rows": lambda: (linear_rows, [draw(2, 3, 4), draw(2, 4, seed=1), draw(2, seed=2)]),
-    "vlgs.heads.rows.layers": lambda: (
-        partial(layers, nn.Sequential(nn.Linear(3, 4), nn.ReLU(), nn.Linear(4, 2)).double()), [draw(5, 3)]
-    ),
-    "vlgs.heads.codebook.Codebook.targets": lambda: (Codebook(2, 3).targets, [draw(4, 3)]),
-    "vlgs.heads.codebook.Codebook.predict": lambda: codebook("predict"),
-    "vlgs.heads.codebook.Codebook.decode": lambda: codebook("decode"),
-    "vlgs.heads.lookup.LookupTable.targets": lambda: (LookupTable(2, 3, 4).targets, [draw(4, 4)]),
-    "vlgs.heads.lookup.LookupTable.predict": lambda: (LookupTable(2, 3, 4).double().predict, [draw(4, 2)]),
-    "vlgs.heads.quantised.QuantisedCodes.predict": lambda: (QuantisedCodes(2, 3, 4, [5]).double().predict, [draw(4, 2)]),
-    "vlgs.heads.quantised.QuantisedCodes.decode": lambda: (quantised().decode, [draw(4, 2)]),
-    "vlgs.heads.quantised.quantiser_loss": lambda: (
-        lambda a, b: quantiser_loss([a, b], [1.0, 0.5], 2.0), [draw(6, 3), draw(6, 3, seed=1)]
-    ),
-    "vlgs.heads.classifier.Classifier.logits": lambda: (classifier().logits, [draw(4, 2)]),
-    "vlgs.heads.classifier.Classifier.targets": lambda: (classifier().targets, [draw(4, 4)]),
-    "vlgs.heads.classifier.Classifier.predict": lambda: (classifier().predict, [draw(4, 2)]),
-    "vlgs.heads.classifier.Classifier.decode": lambda: (classifier().decode, [draw(4, 2)]),
-    "vlgs.objectives.mask_classes.MaskClasses.of": lambda: (
-        lambda codes: bound(MaskClasses(), classifier()).of(codes, torch.tensor([0, -1, 2, 1])), [draw(4, 2)]
-    ),
-    "vlgs.objectives.mask_classes.NeighbourClasses.of": lambda: (
-        bound(NeighbourClasses(), classifier()).of, [draw(3, 1, 2), draw(3, 5, 1, 2, seed=1)]
-    ),
-    "vlgs.objectives.codebook.CodebookLanguage.total": lambda: codebook("total"),
-    "vlgs.objectives.lookup.LookupLanguage.terms": lambda: (
-        lambda codes: tuple(bound(LookupLanguage(), lookup()).terms(codes, torch.tensor([0, 3, 0, 1]), 2.0).values()),
-        [draw(4, 2)],
-    ),
-    "vlgs.objectives.lookup.choice_error": lambda: (
-        lambda scores: choice_error(scores, torch.tensor([2, 0, 2])), [draw(3, 4)]
-    ),
-    "vlgs.objectives.code_classes.CodeClasses.terms": lambda: (
-        lambda codes, doubt: bound(CodeClasses(), quantised()).terms(codes, torch.eye(3).double(), doubt),
-        [draw(3, 2), draw(3, low=0.1, high=0.9)],
-    ),
-    "vlgs.heads.linear.Linear.targets": lambda: (Linear(2, 3).targets, [draw(4, 3)]),
-    "vlgs.heads.linear.Linear.predict": lambda: linear_head("predict"),
-    "vlgs.heads.linear.Linear.decode": lambda: linear_head("decode"),
     "vlgs.fields.splat.SplatModel.predict": lambda: model(lambda m: m.predict(m.render(view()).feature)),  # type: ignore[arg-type]
     "vlgs.fusion.blocks.to_blocks": lambda: (lambda x: to_blocks(x)[:, :, :3], [draw(3, 2)]),
     "vlgs.fusion.blocks.from_blocks": lambda: (lambda x: from_blocks(x.expand(2, 2, BLOCK), 3), [draw(2, 2, 1)]),
@@ -470,44 +305,9 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.gaussians.sh.sh_to_rgb": lambda: (sh_to_rgb, [draw(4, 3)]),
     "vlgs.gaussians.sh.rgb_to_sh": lambda: (rgb_to_sh, [draw(4, 3)]),
     **{f"vlgs.ops.view_color.view_color of degree {degree}": partial(coloring, degree) for degree in range(4)},
-    "vlgs.heads.autoencoder.Autoencoder.encode": lambda: (head().encode, [draw(3, 5)]),
-    "vlgs.heads.autoencoder.Autoencoder.decode": lambda: (head().decode, [draw(3, 3)]),
-    "vlgs.heads.autoencoder.Autoencoder.targets": lambda: (head().targets, [draw(3, 5)]),
-    "vlgs.heads.autoencoder.Autoencoder.predict": lambda: (head().predict, [draw(3, 3)]),
-    "vlgs.heads.identity.Identity.targets": lambda: (Identity(3).targets, [draw(4, 3)]),
-    "vlgs.heads.identity.Identity.predict": lambda: (Identity(3).predict, [draw(4, 3)]),
-    "vlgs.heads.identity.Identity.decode": lambda: (Identity(3).decode, [draw(4, 3)]),
     "vlgs.fields.similarity.cosines": lambda: (cosines, [draw(4, 3), draw(2, 3, seed=1)]),
     "vlgs.fields.similarity.decoded_cosines": lambda: (
         lambda c, t: decoded_cosines(Identity(3).decode, c, t, chunk=4), [draw(3, 2, 3), draw(2, 3, seed=1)]
-    ),
-    "vlgs.fields.hash_grid.contract": lambda: (contract, [draw(3, 3, low=-0.5, high=0.5)]),
-    "vlgs.fields.hash_grid.contract beyond 1": lambda: (contract, [3 + draw(3, 3)]),
-    "vlgs.fields.hash_grid.interpolate": lambda: (
-        lambda t: interpolate(t, *HashGrid(GRID).double().corners(PLACES)), [draw(HashGrid(GRID).table.shape[0], 2)]
-    ),
-    "vlgs.fields.hash_grid.HashGrid.forward": lambda: by_table(lambda grid: grid(PLACES)),
-    "vlgs.fields.rays.Rays.points": lambda: (lambda o, d, t: Rays(o, d).points(t), [draw(2, 3), draw(2, 3, seed=1), draw(2, 4)]),
-    **{
-        f"vlgs.fields.rays.ray_depth, {kind}": lambda kind=kind: (
-            lambda d, w: ray_depth(d, w, kind), [draw(3, 4, low=1, high=2), draw(3, 4, seed=1, low=0.1)]
-        )
-        for kind in get_args(DepthKind)
-    },
-    "vlgs.fields.rays.ray_weights": lambda: (ray_weights, [draw(3, 4, low=0.1), draw(3, 4, seed=1, low=0.1)]),
-    "vlgs.fields.rays.spread": lambda: (
-        lambda w: spread(draw(3, 5).sort(dim=1).values, w), [draw(3, 4, seed=1, low=0.1)]
-    ),
-    "vlgs.fields.radiance.in_cube": lambda: (in_cube, [draw(3, 3, low=-0.5, high=0.5)]),
-    "vlgs.fields.radiance.harmonics": lambda: (harmonics, [draw(3, 3)]),
-    "vlgs.fields.radiance.RadianceField.density": lambda: by_radiance(lambda f, s: f.density(s.places.flatten(0, 1))),
-    "vlgs.fields.radiance.RadianceField.weights": lambda: by_radiance(lambda f, s: f.weights(s)),
-    "vlgs.fields.radiance.RadianceField.forward": lambda: by_radiance(lambda f, s: f(RAYS, s)),
-    "vlgs.fields.language_field.LanguageField.features": lambda: by_language(lambda f, _: f.features(PLACES)),
-    "vlgs.fields.language_field.LanguageField.embed": lambda: by_language(lambda f, x: f.embed(x, 0.3)),
-    "vlgs.fields.language_field.LanguageField.low": lambda: by_language(lambda f, x: f.low(x)),
-    "vlgs.fields.nerf.along": lambda: by_language(
-        lambda f, _: along(f, radiance().sample(RAYS), draw(2, 3, low=0.1), 2)[0]
     ),
     "vlgs.query.relevancy.LerfRelevancy.relevancy": lambda: (
         LerfRelevancy().relevancy, [draw(2, 4), draw(3, 4, seed=1)]

@@ -80,11 +80,14 @@ def run_startup(quick: bool, repeats: int, sweep: bool, out: Path, seed: int) ->
                 own = [*RUN, *small, "progress=false", place, f"seed={seed + turn}"]
                 each.append(parts(own))
             rows += _medians("run", state, each[1:])
+        sweeps: dict[str, list[Times]] = {"warm": [], "cold": []}
         for turn in range(repeats * sweep):
-            for state in ("warm", "cold")[:: 1 if turn % 2 else -1]:  # in turns
+            for state in list(sweeps)[:: 1 if turn % 2 else -1]:  # in turns
                 place = f"results={scratch}/{state}{turn}"
                 asked = [*SWEEP, *small, place, f"warm={str(state == 'warm').lower()}"]
-                rows += _medians("ablate", state, [measured(["-m", "vlgs.ablate", *asked])])
+                sweeps[state].append(measured(["-m", "vlgs.ablate", *asked]))
+        for state, each in sweeps.items():
+            rows += _medians("ablate", state, each) if each else []
     write_record(out / "startup.csv", rows, header)
     show(
         "a run beside its training",
