@@ -46,7 +46,15 @@ from vlgs.text import screen, visible
 
 OWN_KEYS = ("tab", "scenes", "seeds", "name", "results", "dry", "warm")
 SCENES = {
-    "synthetic": ("glassware", "mirrors", "lookalikes", "patchwork"),
+    "synthetic": (
+        "glassware",
+        "mirrors",
+        "lookalikes",
+        "patchwork",
+        "wirework",
+        "rows",
+        "smallware",
+    ),
     "lerf_ovs": ("ramen", "teatime", "figurines", "waldo_kitchen"),
     "ovs3d": ("bed", "bench", "room", "sofa", "lawn"),
     "mipnerf360": ("garden", "bonsai", "kitchen", "room"),
