@@ -75,8 +75,11 @@ AS_WITHOUT: Mapping[str, Any] = {
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "query.masks": None,
     "stages": None,
+    "trainer.color_decay": 1,
     "trainer.exposure": False,
+    "trainer.half_size": 0,
     "trainer.language_decay": 1,
+    "trainer.language_every": 1,
     "trainer.learning_rates.exposure": 1e-3,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while

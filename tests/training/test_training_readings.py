@@ -100,9 +100,9 @@ def test_positions_slow_down_over_the_steps_they_are_given():
 
 def test_codes_and_indicators_slow_down_along_half_a_cosine(tiny_scene: Scene):
     settings = TrainerConfig(1000, LearningRates(), language_decay=0.1)
-    shares = [settings.language_rate(step) for step in (0, 500, 1000, 2000)]
+    shares = [settings.decay("features", step) for step in (0, 500, 1000, 2000)]
     assert shares == pytest.approx([1, 0.55, 0.1, 0.1])
-    assert TrainerConfig(1000, LearningRates()).language_rate(700) == 1
+    assert TrainerConfig(1000, LearningRates()).decay("features", 700) == 1
     module = module_of(tiny_scene, "trainer.iterations=100", "trainer.language_decay=0.1")
     module.set_schedule(50)
     rates = {group["name"]: group["lr"] for group in module.optimizer.param_groups}

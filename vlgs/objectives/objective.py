@@ -67,7 +67,7 @@ class Objective(ABC):
     """Adam's, for the parameters of an objective that is a `torch.nn.Module`."""
 
     def bind(self, setup: Setup) -> None:  # noqa: B027 (most need nothing)
-        """Look at the scene and at the other objectives, once, before the first iteration."""
+        """Look at the scene and at the other objectives: before the first iteration, and again where the views change their size."""
 
     @abstractmethod
     def __call__(self, step: StepView) -> Mapping[str, Float[Tensor, ""]]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vlgs.data.cache import PixelCache
+from vlgs.data.half_size import half_size
 from vlgs.data.sampler import PairSampler
 from vlgs.losses import view_similarity
 from vlgs.skip_count import SkipCount
@@ -73,6 +74,10 @@ class TrainingViews:
         # "No mask" is -1, which indexes the last row, a zero code.
         self._codes = torch.cat([codes, torch.zeros(1, codes.shape[1])])
         self.cache = PixelCache(self._room())
+
+    def at_half_size(self) -> "TrainingViews":
+        """The same views, in the same pairs, with half their width and height."""
+        return TrainingViews(half_size(self.scene), self._codes[:-1], self.sampler, self.counts)
 
     def __getitem__(self, index: int) -> Target:
         """A training view by its place in the scene."""

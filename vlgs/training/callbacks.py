@@ -36,11 +36,10 @@ class Densification(AfterStep):
         config = densifying.config
         if done >= config.densify.stop:
             return
-        state, pair = densifying.state, module.views.sampler.pair(done - 1)
-        for index, gradient, render in zip(
-            pair, module.report.screen_gradients, module.report.renders, strict=True
+        state, report = densifying.state, module.report
+        for camera, gradient, render in zip(
+            report.cameras, report.screen_gradients, report.renders, strict=True
         ):
-            camera = module.views.scene.train[index].camera
             state.accumulate(gradient, render.visible, camera.width, camera.height)
         if done == module.settings.iterations:
             return  # no iteration would train what comes, or bring back what is made transparent

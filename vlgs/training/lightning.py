@@ -91,6 +91,7 @@ class VLGSModule(L.LightningModule):
             )
             if keeps and has_frozen_shape(model)
             else None,
+            settings,
         )
         self.optimizer = self._make_optimizer()
         self.next_step = 0
@@ -137,6 +138,7 @@ class VLGSModule(L.LightningModule):
             float(done.total.detach()),
             done.seen.log,
             tuple(target.image for target in done.seen.targets),
+            tuple(target.view.camera for target in done.seen.targets),
         )
 
     def _make_optimizer(self) -> torch.optim.Adam:
@@ -160,9 +162,9 @@ class VLGSModule(L.LightningModule):
         for group in self.optimizer.param_groups:
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.densifying.extent
-            if group["name"] in ("features", "indicator_logits"):
+            elif group["name"] in self.model.attributes:
                 rate = self.model.attributes[group["name"]].rate
-                group["lr"] = rate * self.settings.language_rate(step)
+                group["lr"] = rate * self.settings.decay(group["name"], step)
         highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.densifying.config.init is not None or "shN" in self.settings.freeze

@@ -9,6 +9,9 @@ from vlgs.values import require_range
 MOST_ITERATIONS = 10**9
 """Upper limit of `iterations`, far above any useful value."""
 
+_LANGUAGE = ("features", "indicator_logits")
+_COLOR = ("quats", "log_scales", "opacity_logits", "sh0", "shN")
+
 SMALLEST_RATE = 1e-30
 """Above 0; the decay from one rate to another would leave the range of floats beyond it."""
 
@@ -88,6 +91,13 @@ class TrainerConfig:
     """Iterations over which the rate of the positions decays; None: all of the run (conf/README.md, D.11)."""
     language_decay: float = 1.0
     """Share of their rates that codes and indicators have left in the end, after half a cosine over the run; 1: they stay."""
+    color_decay: float = 1.0
+    """The same for quats, log_scales, opacity_logits, sh0 and shN; positions have `LearningRates.means_final`."""
+    language_every: int = 1
+    """Iterations from one that learns language to the next; colour is learned in all. Without colour, in all."""
+    half_size: float = 0.0
+    """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
+    are frozen none do."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
@@ -105,7 +115,9 @@ class TrainerConfig:
                 f"{self.sh_every}, {self.log_every}, {self.checkpoint_every}"
             )
 
-        require_range("trainer", 0, 1, language_decay=self.language_decay)
+        shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
+        require_range("trainer", 0, 1, **shares, half_size=self.half_size)
+        require_range("trainer", 1, MOST_ITERATIONS, language_every=self.language_every)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
 
@@ -117,7 +129,14 @@ class TrainerConfig:
             return rates.means * (1 - share) + rates.means_final * share  # no logarithm leads to 0
         return rates.means * (rates.means_final / rates.means) ** share
 
-    def language_rate(self, step: int) -> float:
-        """Share of their rates that codes and indicators have at a step."""
+    def decay(self, name: str, step: int) -> float:
+        """Share of its rate that a parameter of the Gaussians has at a step: half a cosine over the run."""
+        end = (
+            self.language_decay if name in _LANGUAGE else self.color_decay if name in _COLOR else 1
+        )
         fallen = (1 - math.cos(math.pi * min(step / self.iterations, 1.0))) / 2
-        return 1 + (self.language_decay - 1) * fallen
+        return 1 + (end - 1) * fallen
+
+    def is_half_size(self, step: int) -> bool:
+        """Whether an iteration sees views at half their size."""
+        return step < self.half_size * self.iterations

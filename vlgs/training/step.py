@@ -12,11 +12,13 @@ from torch import Tensor, nn
 
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.losses import masked_mse
-from vlgs.objectives import Setup, StepView
+from vlgs.objectives import Objective, Setup, StepView
 from vlgs.objectives.objective import all_needs
-from vlgs.objectives.targets import Target
-from vlgs.training.cached_renders import CachedRenders
+from vlgs.objectives.targets import Target, TrainingViews
+from vlgs.training.cached_renders import CachedRenders, has_frozen_shape
 from vlgs.training.exposure import Exposure
+from vlgs.training.settings import TrainerConfig
+from vlgs.types import Camera
 
 COLOR = frozenset({"color"})
 
@@ -35,6 +37,8 @@ class StepReport:
     log: Mapping[str, float] = field(default_factory=dict)
     """What objectives say: ``blend_weight`` is lambda * SSIM(I1, I2) of Eq. 11, absent where no blended view counted."""
     photographs: tuple[Float[Tensor, "h w 3"], ...] = ()
+    cameras: tuple[Camera, ...] = ()
+    """Of the real views, in the size that was rendered."""
 
     @cached_property
     @torch.no_grad()
@@ -67,6 +71,7 @@ class TrainingStep:
         densify_on_color: Whether densification goes by the gradients of colour's objectives alone.
         exposure: A map of colour per photograph, or None.
         frozen: Renders from kept weights where shapes and weights are frozen, or None.
+        settings: Which iterations learn language, and which see views at half their size.
     """
 
     model: SplatModel
@@ -74,26 +79,50 @@ class TrainingStep:
     densify_on_color: bool
     exposure: Exposure | None
     frozen: CachedRenders | None
+    settings: TrainerConfig
+
+    def __post_init__(self) -> None:
+        self.bound = self.setup
+        """What the objectives look at."""
 
     @cached_property
-    def needs(self) -> frozenset[str]:
-        """What is rendered of the real views."""
-        return all_needs(list(self.setup.objectives.values()))
+    def half_setup(self) -> Setup:
+        """The same at half the width and height."""
+        return replace(self.setup, views=self.setup.views.at_half_size())
+
+    def views(self, step: int) -> TrainingViews:
+        """What an iteration sees, shown to the objectives where it is not what the last one saw."""
+        small = self.settings.is_half_size(step) and not has_frozen_shape(self.model)
+        setup = self.half_setup if small else self.setup
+        if setup is not self.bound:
+            for objective in setup.objectives.values():
+                objective.bind(setup)
+            self.bound = setup
+        return setup.views
+
+    def objectives(self, step: int) -> list[Objective]:
+        """Those that count in an iteration."""
+        all_of_them = list(self.setup.objectives.values())
+        of_color = [objective for objective in all_of_them if objective.needs == COLOR]
+        return of_color if of_color and step % self.settings.language_every else all_of_them
 
     def forward(self, step: int) -> Forward:
         """Render and judge; fusion runs once for all views."""
         pair = self.setup.views.sampler.pair(step)
-        targets = (self.setup.views[pair[0]], self.setup.views[pair[1]])
+        views = self.views(step)
+        targets = (views[pair[0]], views[pair[1]])
+        objectives = self.objectives(step)
+        needs = all_needs(objectives)
         fused = self.model.fuse()
         first, second = (
-            self._exposed(index, self.render(index, target, fused))
+            self._exposed(index, self.render(index, target, fused, needs))
             for index, target in zip(pair, targets, strict=True)
         )
         again = partial(self.model.render, fused=fused)
         seen = StepView(step, pair, targets, (first, second), fused, again)
         terms: dict[str, Tensor] = {}
         of_color: list[Tensor] = []
-        for objective in self.setup.objectives.values():
+        for objective in objectives:
             own = objective(seen)
             if objective.needs == COLOR:
                 of_color += own.values()
@@ -118,10 +147,12 @@ class TrainingStep:
             for mean2d in screen
         )
 
-    def render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
+    def render(
+        self, index: int, target: Target, fused: FusedGaussians, needs: frozenset[str]
+    ) -> ViewRender:
         """A training view in all that is needed of it; a view without language in colour alone."""
-        color, further = "color" in self.needs, self._further
-        language = ("feature" in self.needs and target.has_language) or not (color or further)
+        color, further = "color" in needs, tuple(sorted(needs - {"color", "feature"}))
+        language = ("feature" in needs and target.has_language) or not (color or further)
         camera = target.view.camera
         if self.frozen is not None and not further:
             kept = self.frozen.render(index, camera, color, language, fused)
@@ -150,11 +181,6 @@ class TrainingStep:
             for name, part in named.items()
             if isinstance(part, nn.Module) and next(part.parameters(), None) is not None
         }
-
-    @cached_property
-    def _further(self) -> tuple[str, ...]:
-        """Attributes beside colour and language that objectives need rendered."""
-        return tuple(sorted(self.needs - {"color", "feature"}))
 
     def _exposed(self, index: int, render: ViewRender) -> ViewRender:
         if self.exposure is None or render.color is None:

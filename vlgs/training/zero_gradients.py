@@ -62,15 +62,14 @@ class StuckAlarm(AfterStep):
         assert isinstance(module, VLGSModule)
         if module.next_step % self.every:
             return
-        means2d = [render.mean2d for render in module.report.renders]
-        views = module.views.sampler.pair(module.next_step - 1)
-        cameras = [module.views.scene.train[index].camera for index in views]
+        report = module.report
+        means2d = [render.mean2d for render in report.renders]
         weights = (r.name for r in module.model.attributes.values() if r.role == "weight")
         for name in weights:
             gradient = module.model.splats[name].grad
             if gradient is None:  # this weight takes no part, e.g. with indicator=opacity
                 continue
-            share = self.shares[name] = stuck_share(gradient, means2d, cameras)
+            share = self.shares[name] = stuck_share(gradient, means2d, report.cameras)
             self.in_a_row[name] = self.in_a_row.get(name, 0) + 1 if share >= ALARM else 0
             if self.in_a_row[name] >= LOOKS and name not in self.alarmed:
                 self.alarmed.add(name)

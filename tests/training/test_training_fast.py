@@ -1,0 +1,134 @@
+"""What ``trainer=fast`` does less of: language in some iterations, small views at first, larger steps that slow down."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_runs import TINY, composed
+
+from vlgs.config import instantiate
+from vlgs.runs import RunFolder
+from vlgs.training.build import Parts, build_module
+from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lightning import VLGSModule
+from vlgs.training.settings import LearningRates, TrainerConfig
+from vlgs.types import Scene
+
+LESS = (
+    "trainer.iterations=16",
+    "trainer.half_size=0.5",
+    "trainer.language_every=3",
+    "trainer.color_decay=0.1",
+    "gaussians.densify={start: 2, stop: 15, every: 4, reset_every: 0}",
+    "gaussians.densify.grad_threshold=1e-6",
+)
+
+
+def module_of(scene: Scene, *overrides: str) -> VLGSModule:
+    config = composed(*TINY, "trainer=smoke", *overrides)
+    torch.manual_seed(config.seed)
+    parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+    return build_module(scene, parts, config.seed)
+
+
+def trained(
+    scene: Scene, folder: Path, *overrides: str, each: Callable[[VLGSModule], None] | None = None
+) -> VLGSModule:
+    module = module_of(scene, *overrides)
+    original = module.training_step
+
+    def step(number: int, batch_idx: int) -> None:
+        original(number, batch_idx)
+        if each is not None:
+            each(module)
+
+    module.training_step = step  # type: ignore[method-assign]
+    fit(module, RunFolder(folder), FitOptions(meta={}, progress=False))
+    return module
+
+
+def test_codes_move_in_every_third_iteration_and_colour_in_all(tiny_scene: Scene, tmp_path: Path):
+    seen: list[dict[str, torch.Tensor]] = []
+
+    def each(module: VLGSModule) -> None:
+        splats = module.model.splats
+        names = ("features", "indicator_logits", "sh0", "means")
+        seen.append({name: splats[name].detach().clone() for name in names})
+
+    still = "gaussians.densify.stop=0"
+    trained(tiny_scene, tmp_path, *LESS, still, "fusion=none", each=each)
+    moved = {
+        name: [not torch.equal(a[name], b[name]) for a, b in pairwise(seen)] for name in seen[0]
+    }
+    every_third = [number % 3 == 0 for number in range(1, 16)]
+    assert moved["features"] == moved["indicator_logits"] == every_third
+    assert all(moved["sh0"])
+    assert all(moved["means"])
+
+
+def test_language_alone_is_learned_in_every_iteration(tiny_scene: Scene):
+    frozen = "trainer.freeze=[means,quats,log_scales,sh0,shN,opacity_logits]"
+    module = module_of(tiny_scene, *LESS, "gaussians.densify.stop=0", "fusion=none", frozen)
+    del module.step.setup.objectives["photometric"]  # type: ignore[attr-defined]
+    assert module.step.objectives(1) == module.step.objectives(3) != []
+    # Where no shape is learned, all views keep their size, and their kept weights serve.
+    assert module.step.views(0) is module.views
+
+
+def test_views_are_small_in_the_first_half(tiny_scene: Scene, tmp_path: Path):
+    sizes: list[set[tuple[int, int]]] = []
+
+    def each(module: VLGSModule) -> None:
+        report = module.report
+        sizes.append({(camera.width, camera.height) for camera in report.cameras})
+        images = [render.color for render in report.renders]
+        assert all(
+            i is not None and i.shape == p.shape
+            for i, p in zip(images, report.photographs, strict=True)
+        )
+
+    trained(tiny_scene, tmp_path, *LESS, each=each)
+    whole = tiny_scene.train[0].camera
+    small = ((whole.width + 1) // 2, (whole.height + 1) // 2)
+    assert sizes == [{small}] * 8 + [{(whole.width, whole.height)}] * 8
+
+
+@pytest.mark.parametrize("stop", [5, 8, 11])
+def test_stopped_before_at_and_after_the_change_it_goes_on_to_the_same_bits(
+    tiny_scene: Scene, tmp_path: Path, stop: int
+):
+    whole = trained(tiny_scene, tmp_path / "whole", *LESS)
+
+    def interrupt(module: VLGSModule) -> None:
+        module.trainer.should_stop = module.next_step == stop
+
+    first = trained(tiny_scene, tmp_path / "parts", *LESS, each=interrupt)
+    assert first.next_step == stop
+    second = trained(tiny_scene, tmp_path / "parts", *LESS)
+    splats = whole.model.splats
+    assert whole.model.count != len(tiny_scene.points)
+    assert all(torch.equal(splats[name], second.model.splats[name]) for name in splats)
+
+
+def test_rates_of_colour_and_shape_fall_along_half_a_cosine(tiny_scene: Scene):
+    module = module_of(tiny_scene, *LESS, "trainer.learning_rates.quats=0.002")
+    module.set_schedule(8)
+    rates = {group["name"]: group["lr"] for group in module.optimizer.param_groups}
+    given = LearningRates()
+    for name in ("log_scales", "sh0", "shN", "opacity_logits"):
+        assert rates[name] == pytest.approx(0.55 * getattr(given, name))
+    assert rates["quats"] == pytest.approx(0.55 * 0.002)
+    assert rates["features"] == given.features
+    assert rates["means"] == pytest.approx(module.settings.means_rate(8) * module.densifying.extent)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("color_decay", 1.5), ("half_size", -0.1), ("half_size", 1.1), ("language_every", 0)],
+)
+def test_what_cannot_be_is_refused_by_name(key: str, value: float):
+    with pytest.raises(ValueError, match=f"trainer: {key} must be"):
+        TrainerConfig(10, LearningRates(), **{key: value})  # type: ignore[arg-type]
