@@ -9,6 +9,7 @@ from vlgs.bench import curve, train
 from vlgs.bench.curve import evaluated_at, seconds_to
 from vlgs.bench.presets import composed
 from vlgs.bench.record import read_record
+from vlgs.identity import RESULTS_VERSION
 from vlgs.skips import SKIPS
 
 
@@ -48,7 +49,7 @@ def test_photographs_are_told_where_their_language_is():
 
 def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scenes = {"synthetic": (*train.QUICK, "trainer.iterations=6")}
-    rows = train.run_train(scenes, ["neither"], tmp_path, 2, 1, 0)
+    rows = train.run_train(scenes, ["neither"], tmp_path, 2, 1, [0])
     assert rows[0].iterations == 6
     assert rows[0].seconds > 0
     assert rows[0].psnr is not None
@@ -61,8 +62,25 @@ def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (tmp_path / "train.png").stat().st_size > 0
 
     monkeypatch.setattr(train, "fit", lambda *_: pytest.fail("trained again"))
-    again = train.run_train(scenes, ["neither"], tmp_path, 2, 1, 0)
+    again = train.run_train(scenes, ["neither"], tmp_path, 2, 1, [0])
     assert again[0].seconds == pytest.approx(rows[0].seconds, rel=1e-5)
+
+
+def test_rows_of_other_seeds_stay_and_effects_are_paired_by_seed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    scenes = {"synthetic": (*train.QUICK, "trainer.iterations=3")}
+    train.run_train(scenes, ["neither"], tmp_path, 1, 1, [0])
+    train.run_train(scenes, ["neither", "no fusion"], tmp_path, 1, 1, [1, 2])
+    assert "against neither, paired by seed" in capsys.readouterr().out
+    table = read_record(tmp_path / "train.csv")
+    assert list(zip(table.label, table.seed, strict=True)) == [
+        ("neither", 0), ("neither", 1), ("no fusion", 1), ("neither", 2), ("no fusion", 2),
+    ]  # fmt: skip
+    again = table.to_csv(index=False)
+    (tmp_path / "train.csv").write_text(again.replace(f",{RESULTS_VERSION},", ",1,"))
+    train.run_train(scenes, ["neither"], tmp_path, 1, 1, [2])
+    assert list(read_record(tmp_path / "train.csv").seed) == [2]
 
 
 def test_evaluation_is_not_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -77,7 +95,7 @@ def test_evaluation_is_not_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(curve, "score", slow)
     scenes = {"synthetic": (*train.QUICK, "trainer.iterations=4")}
-    rows = train.run_train(scenes, ["neither"], tmp_path, 4, 1, 0)
+    rows = train.run_train(scenes, ["neither"], tmp_path, 4, 1, [0])
     # The fake clock also ticks for TrainingClock, between the two readings of an iteration: 2 or 3 each, never 100.
     assert rows[0].seconds <= 4 * 4
 

@@ -105,6 +105,7 @@ def train(parser: ArgumentParser) -> Runner:
         help="of the photographs, e.g. data.features=FOLDER query=vocab_softmax",
     )  # fmt: skip
     parser.add_argument("--no-synthetic", action="store_true", help="the photographs alone")
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the training; default: --seed")
     parser.add_argument("--points", type=int, default=8, help="evaluations per curve")
     parser.add_argument("--train-threads", type=int, default=2)
     parser.add_argument("--psnr", type=float, help="target in dB; default: that of default - 1")
@@ -122,7 +123,8 @@ def train(parser: ArgumentParser) -> Runner:
         )
         points = 2 if args.quick else args.points
         targets = (args.psnr, args.miou)
-        run_train(scenes, labels, args.out, points, args.train_threads, args.seed, targets)
+        seeds = args.seeds or [args.seed]
+        run_train(scenes, labels, args.out, points, args.train_threads, seeds, targets)
         return 0
 
     return run

@@ -2,8 +2,9 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from statistics import fmean, median
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -23,9 +24,11 @@ from vlgs.bench.record import (
     write_record,
 )
 from vlgs.experiment import construct
+from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS, turn
 from vlgs.training.fit import FitOptions, fit
+from vlgs.training.settings import LearningRates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,10 +47,23 @@ def _skips(on: bool) -> tuple[str, ...]:
     return turn((s.name for s in SKIPS if s.switchable and s.name not in left), on)
 
 
+LEVERS: dict[str, tuple[str, ...]] = {
+    "paper's rates": tuple(
+        f"trainer.learning_rates.{name}={rate:g}" for name, rate in asdict(LearningRates()).items()
+    ),
+    "rates that stay": ("trainer.color_decay=1",),
+    "language in all": ("trainer.language_every=1",),
+    "whole views": ("trainer.half_size=0",),
+    "default's threshold": ("gaussians.densify.grad_threshold=6.0e-4",),
+}
+"""What ``trainer=fast`` is without one of its parts."""
+
 RECIPES: dict[str, tuple[str, ...]] = {
     "default": (),
     "exact": ("raster=exact",),
-    "fast": ("raster=fast",),
+    "trainer=fast": ("trainer=fast",),
+    **{f"fast, {name}": ("trainer=fast", *changed) for name, changed in LEVERS.items()},
+    "raster=fast": ("raster=fast",),
     "no blend": ("blend=none",),
     "no fusion": ("fusion=none",),
     "neither": ("blend=none", "fusion=none"),
@@ -56,6 +72,7 @@ RECIPES: dict[str, tuple[str, ...]] = {
     "no skips": _skips(on=False),
     "short": ("trainer.iterations=500", "trainer.sh_every=100", "gaussians.densify.start=100", "gaussians.densify.stop=350"),
     "photos": ("trainer=photos",),
+    "fast photos": ("trainer=fast_photos",),
 }  # fmt: skip
 """Label -> overrides of `python -m vlgs.run`."""
 
@@ -70,6 +87,8 @@ class Summary:
     scene: str
     label: str
     overrides: str
+    seed: int
+    results_version: int
     iterations: int
     seconds: float
     """Wall clock of all iterations."""
@@ -124,26 +143,56 @@ def run_train(
     out: Path,
     points: int,
     threads: int,
-    seed: int,
+    seeds: Sequence[int],
     targets: tuple[float | None, float | None] = (None, None),
 ) -> list[Summary]:
-    """Train what has no curve yet; write train.csv and train.png, print the table.
+    """Train what has no curve yet, seed by seed; write train.csv and train.png, print the tables.
 
     A curve is written when its training ends and is not trained again: its file is named after the run id, so that a change of
-    configuration, data or results version gives a new one. Without targets they are 1 dB and 0.02 below the end of ``default``
-    (of the first label where it is not among them).
+    configuration, data or results version gives a new one. Rows of other scenes, recipes and seeds stay in train.csv while they are of
+    the same results version. Without targets they are 1 dB and 0.02 below the end of ``default`` (of the first label where it is not
+    among them).
     """
-    header = provenance(seed, unit="seconds of training, evaluation and set-up not counted")
-    found = {}
-    for extra in scenes.values():
-        for label in labels:
-            curve = _curve(label, (*extra, *RECIPES[label]), out, points, threads, seed)
-            found[str(curve.scene.iloc[0]), label] = curve
-    rows = _summaries(found, targets)
-    write_record(out / "train.csv", rows, header)
-    draw_train(out / "train", found)
+    header = provenance(
+        None,
+        unit="seconds of training, evaluation and set-up not counted",
+        training_threads=threads,
+    )
+    path, rows = out / "train.csv", []
+    for seed in seeds:
+        found = {}
+        for extra in scenes.values():
+            for label in labels:
+                curve = _curve(label, (*extra, *RECIPES[label]), out, points, threads, seed)
+                found[str(curve.scene.iloc[0]), label] = curve
+        rows += _summaries(found, targets, seed)
+        write_record(path, _beside(path, rows), header)
+        if seed == seeds[0]:
+            draw_train(out / "train", found)
     _print(rows)
+    if len(labels) > 1:
+        _print_effects(rows, labels[0])
     return rows
+
+
+def _beside(path: Path, rows: Sequence[Summary]) -> list[Summary]:
+    """The rows, after those of the file that are of other trainings and today's results version."""
+    if not path.is_file():
+        return list(rows)
+    table = read_record(path).astype(object)
+    if set(table.columns) != {field.name for field in fields(Summary)}:
+        return list(rows)
+    lines = table.where(table.notna(), None).to_dict(orient="records")
+    mine = {(row.scene, row.label, row.seed) for row in rows}
+    known = [Summary(**{str(key): value for key, value in line.items()}) for line in lines]
+    return [
+        *(
+            k
+            for k in known
+            if k.results_version == RESULTS_VERSION and (k.scene, k.label, k.seed) not in mine
+        ),
+        *rows,
+    ]
 
 
 def _curve(
@@ -179,7 +228,9 @@ def _values(curve: pd.DataFrame, column: str) -> list[float | None]:
 
 
 def _summaries(
-    curves: dict[tuple[str, str], pd.DataFrame], targets: tuple[float | None, float | None]
+    curves: dict[tuple[str, str], pd.DataFrame],
+    targets: tuple[float | None, float | None],
+    seed: int,
 ) -> list[Summary]:
     rows = []
     for scene in dict.fromkeys(scene for scene, _ in curves):
@@ -197,7 +248,7 @@ def _summaries(
             psnrs, mious = _values(curve, "psnr"), _values(curve, "miou")
             rows.append(
                 Summary(
-                    scene, label, " ".join(RECIPES[label]), int(curve.iteration.iloc[-1]), wall[-1], cpu[-1],
+                    scene, label, " ".join(RECIPES[label]), seed, RESULTS_VERSION, int(curve.iteration.iloc[-1]), wall[-1], cpu[-1],
                     psnrs[-1], mious[-1], int(curve.gaussians.iloc[-1]),
                     psnr, seconds_to(psnr, wall, psnrs), seconds_to(psnr, cpu, psnrs),
                     miou, seconds_to(miou, wall, mious), seconds_to(miou, cpu, mious),
@@ -246,19 +297,42 @@ def _draw_curves(panel: "Axes", curves: dict[str, pd.DataFrame], column: str) ->
     panel.set_xlabel("seconds of training (wall clock, evaluation not counted)")
 
 
-def _print(rows: Sequence[Summary]) -> None:
-    def number(value: float | None, digits: int) -> str:
-        return "--" if value is None else f"{value:.{digits}f}"
+def number(value: float | None, digits: int, sign: str = "") -> str:
+    """A cell of a table."""
+    return "--" if value is None else f"{value:{sign}.{digits}f}"
 
+
+def _print_effects(rows: Sequence[Summary], first: str) -> None:
+    """Every recipe against the first one, scene by scene, seed by seed."""
+    base = {(row.scene, row.seed): row for row in rows if row.label == first}
+    groups: dict[tuple[str, str], list[tuple[Summary, Summary]]] = {}
+    for row in rows:
+        if row.label != first:
+            groups.setdefault((row.scene, row.label), []).append((row, base[row.scene, row.seed]))
+    lines = []
+    for (scene, label), pairs in groups.items():
+        psnr = [a.psnr - b.psnr for a, b in pairs if a.psnr is not None and b.psnr is not None]
+        miou = [a.miou - b.miou for a, b in pairs if a.miou is not None and b.miou is not None]
+        cpu = median(a.cpu_seconds / b.cpu_seconds for a, b in pairs)
+        count = fmean(a.gaussians / b.gaussians for a, b in pairs)
+        lines.append((
+            scene, label, f"{len(pairs)}", number(cpu, 2), number(fmean(psnr) if psnr else None, 2, "+"),
+            number(fmean(miou) if miou else None, 3, "+"), number(count, 2),
+        ))  # fmt: skip
+    columns = ("scene", "recipe", "seeds", "CPU, median ratio", "PSNR", "mIoU", "Gaussians, ratio")
+    show(f"against {first}, paired by seed; means but for CPU", columns, lines)
+
+
+def _print(rows: Sequence[Summary]) -> None:
     lines = [
         (
-            r.scene, r.label, f"{r.iterations}", f"{r.seconds:.1f}", f"{r.cpu_seconds:.1f}", f"{r.gaussians:,}",
+            r.scene, r.label, f"{r.seed}", f"{r.iterations}", f"{r.seconds:.1f}", f"{r.cpu_seconds:.1f}", f"{r.gaussians:,}",
             number(r.psnr, 2), number(r.miou, 3), number(r.seconds_to_psnr, 1), number(r.cpu_to_psnr, 1),
             number(r.seconds_to_miou, 1), number(r.cpu_to_miou, 1),
         )
         for r in rows
     ]  # fmt: skip
-    columns = ("scene", "recipe", "iterations", "s", "CPU s", "Gaussians", "PSNR", "mIoU")
+    columns = ("scene", "recipe", "seed", "iterations", "s", "CPU s", "Gaussians", "PSNR", "mIoU")
     to = ("s to PSNR", "CPU", "s to mIoU", "CPU")
     show("training: seconds in all and to the targets", (*columns, *to), lines)
     for scene in dict.fromkeys(r.scene for r in rows):
