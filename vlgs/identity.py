@@ -79,7 +79,6 @@ AS_WITHOUT: Mapping[str, Any] = {
     "trainer.exposure": False,
     "trainer.half_size": 0,
     "trainer.language_decay": 1,
-    "trainer.language_every": 1,
     "trainer.learning_rates.exposure": 1e-3,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while

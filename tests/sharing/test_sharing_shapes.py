@@ -229,7 +229,7 @@ def test_kept_weights_are_those_of_both_shapes(tiny_scene: Scene, frozen: bool):
         module.model.splats["language_log_scales"] += 0.5
         module.model.splats["features"].fill_(0.3)
     fused, target = module.model.fuse(), module.views[0]
-    kept = module.step.render(0, target, fused, frozenset({"color", "feature"}))
+    kept = module.step.render(0, target, fused)
     plain = module.model.render(target.view.camera, fused=fused)
     assert (module.step.frozen is not None) == frozen
     assert kept.feature is not None

@@ -1,8 +1,7 @@
-"""What ``trainer=fast`` does less of: language in some iterations, small views at first, larger steps that slow down."""
+"""What ``trainer=fast`` does: small views at first, large steps that slow down."""
 
 from collections.abc import Callable
 from dataclasses import fields
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ from vlgs.types import Scene
 LESS = (
     "trainer.iterations=16",
     "trainer.half_size=0.5",
-    "trainer.language_every=3",
     "trainer.color_decay=0.1",
     "gaussians.densify={start: 2, stop: 15, every: 4, reset_every: 0}",
     "gaussians.densify.grad_threshold=1e-6",
@@ -50,32 +48,10 @@ def trained(
     return module
 
 
-def test_codes_move_in_every_third_iteration_and_colour_in_all(tiny_scene: Scene, tmp_path: Path):
-    seen: list[dict[str, torch.Tensor]] = []
-
-    def each(module: VLGSModule) -> None:
-        splats = module.model.splats
-        names = ("features", "indicator_logits", "sh0", "means")
-        seen.append({name: splats[name].detach().clone() for name in names})
-
-    still = "gaussians.densify.stop=0"
-    trained(tiny_scene, tmp_path, *LESS, still, "fusion=none", each=each)
-    moved = {
-        name: [not torch.equal(a[name], b[name]) for a, b in pairwise(seen)] for name in seen[0]
-    }
-    every_third = [number % 3 == 0 for number in range(1, 16)]
-    assert moved["features"] == moved["indicator_logits"] == every_third
-    assert all(moved["sh0"])
-    assert all(moved["means"])
-
-
-def test_language_alone_is_learned_in_every_iteration(tiny_scene: Scene):
+def test_where_no_shape_is_learned_all_views_keep_their_size(tiny_scene: Scene):
     frozen = "trainer.freeze=[means,quats,log_scales,sh0,shN,opacity_logits]"
     module = module_of(tiny_scene, *LESS, "gaussians.densify.stop=0", "fusion=none", frozen)
-    del module.step.setup.objectives["photometric"]  # type: ignore[attr-defined]
-    assert module.step.objectives(1) == module.step.objectives(3) != []
-    # Where no shape is learned, all views keep their size, and their kept weights serve.
-    assert module.step.views(0) is module.views
+    assert module.step.views(0) is module.views  # whose kept weights serve
 
 
 def test_views_are_small_in_the_first_half(tiny_scene: Scene, tmp_path: Path):
@@ -127,7 +103,7 @@ def test_rates_of_colour_and_shape_fall_along_half_a_cosine(tiny_scene: Scene):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("color_decay", 1.5), ("half_size", -0.1), ("half_size", 1.1), ("language_every", 0)],
+    [("color_decay", 1.5), ("half_size", -0.1), ("half_size", 1.1)],
 )
 def test_what_cannot_be_is_refused_by_name(key: str, value: float):
     with pytest.raises(ValueError, match=f"trainer: {key} must be"):

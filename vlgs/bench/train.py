@@ -52,9 +52,9 @@ LEVERS: dict[str, tuple[str, ...]] = {
         f"trainer.learning_rates.{name}={rate:g}" for name, rate in asdict(LearningRates()).items()
     ),
     "rates that stay": ("trainer.color_decay=1",),
-    "language in all": ("trainer.language_every=1",),
     "whole views": ("trainer.half_size=0",),
     "default's threshold": ("gaussians.densify.grad_threshold=6.0e-4",),
+    "harmonics a twentieth": ("trainer.learning_rates.shN=1.5e-3",),
 }
 """What ``trainer=fast`` is without one of its parts."""
 

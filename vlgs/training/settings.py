@@ -93,8 +93,6 @@ class TrainerConfig:
     """Share of their rates that codes and indicators have left in the end, after half a cosine over the run; 1: they stay."""
     color_decay: float = 1.0
     """The same for quats, log_scales, opacity_logits, sh0 and shN; positions have `LearningRates.means_final`."""
-    language_every: int = 1
-    """Iterations from one that learns language to the next; colour is learned in all. Without colour, in all."""
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
@@ -117,7 +115,6 @@ class TrainerConfig:
 
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
-        require_range("trainer", 1, MOST_ITERATIONS, language_every=self.language_every)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
 

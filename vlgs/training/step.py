@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.losses import masked_mse
-from vlgs.objectives import Objective, Setup, StepView
+from vlgs.objectives import Setup, StepView
 from vlgs.objectives.objective import all_needs
 from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.training.cached_renders import CachedRenders, has_frozen_shape
@@ -71,7 +71,7 @@ class TrainingStep:
         densify_on_color: Whether densification goes by the gradients of colour's objectives alone.
         exposure: A map of colour per photograph, or None.
         frozen: Renders from kept weights where shapes and weights are frozen, or None.
-        settings: Which iterations learn language, and which see views at half their size.
+        settings: Which iterations see views at half their size.
     """
 
     model: SplatModel
@@ -100,29 +100,26 @@ class TrainingStep:
             self.bound = setup
         return setup.views
 
-    def objectives(self, step: int) -> list[Objective]:
-        """Those that count in an iteration."""
-        all_of_them = list(self.setup.objectives.values())
-        of_color = [objective for objective in all_of_them if objective.needs == COLOR]
-        return of_color if of_color and step % self.settings.language_every else all_of_them
+    @cached_property
+    def needs(self) -> frozenset[str]:
+        """What is rendered of the real views."""
+        return all_needs(list(self.setup.objectives.values()))
 
     def forward(self, step: int) -> Forward:
         """Render and judge; fusion runs once for all views."""
         pair = self.setup.views.sampler.pair(step)
         views = self.views(step)
         targets = (views[pair[0]], views[pair[1]])
-        objectives = self.objectives(step)
-        needs = all_needs(objectives)
         fused = self.model.fuse()
         first, second = (
-            self._exposed(index, self.render(index, target, fused, needs))
+            self._exposed(index, self.render(index, target, fused))
             for index, target in zip(pair, targets, strict=True)
         )
         again = partial(self.model.render, fused=fused)
         seen = StepView(step, pair, targets, (first, second), fused, again)
         terms: dict[str, Tensor] = {}
         of_color: list[Tensor] = []
-        for objective in objectives:
+        for objective in self.setup.objectives.values():
             own = objective(seen)
             if objective.needs == COLOR:
                 of_color += own.values()
@@ -147,12 +144,10 @@ class TrainingStep:
             for mean2d in screen
         )
 
-    def render(
-        self, index: int, target: Target, fused: FusedGaussians, needs: frozenset[str]
-    ) -> ViewRender:
+    def render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
         """A training view in all that is needed of it; a view without language in colour alone."""
-        color, further = "color" in needs, tuple(sorted(needs - {"color", "feature"}))
-        language = ("feature" in needs and target.has_language) or not (color or further)
+        color, further = "color" in self.needs, self._further
+        language = ("feature" in self.needs and target.has_language) or not (color or further)
         camera = target.view.camera
         if self.frozen is not None and not further:
             kept = self.frozen.render(index, camera, color, language, fused)
@@ -181,6 +176,11 @@ class TrainingStep:
             for name, part in named.items()
             if isinstance(part, nn.Module) and next(part.parameters(), None) is not None
         }
+
+    @cached_property
+    def _further(self) -> tuple[str, ...]:
+        """Attributes beside colour and language that objectives need rendered."""
+        return tuple(sorted(self.needs - {"color", "feature"}))
 
     def _exposed(self, index: int, render: ViewRender) -> ViewRender:
         if self.exposure is None or render.color is None:
