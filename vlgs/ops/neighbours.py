@@ -52,10 +52,10 @@ class _NeighbourProducts(torch.autograd.Function):
         places = [*enumerate(_SHIFTS)][::-1]
         for first, last in _bands(image, len(image)):
             for k, (y, x) in places:  # as a neighbour of inner pixels
-                top, end = max(0, first - y), min(rows, last - y)
+                top, end = max(0, first - y), max(0, min(rows, last - y))
                 product = image[top + 1 : end + 1, 1 : w - 1] * d_out[k, top:end]
                 d_image[top + y : end + y, x : x + w - 2] += product
-            top, end = max(0, first - 1), min(rows, last - 1)
+            top, end = max(0, first - 1), max(0, min(rows, last - 1))
             d_inner = torch.zeros_like(image[top + 1 : end + 1, 1 : w - 1])
             for k, (y, x) in places:
                 d_inner += image[top + y : end + y, x : x + w - 2] * d_out[k, top:end]

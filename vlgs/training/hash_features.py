@@ -194,11 +194,16 @@ class HashLearner(Learner):
             rows = read()
             rows = _nearest(rows[..., None] if rows.dim() == 2 else rows, size).long()
             # Pixels of the same masks have one mean: a view has some hundred.
-            sets, which = rows.flatten(0, 1).unique(dim=0, return_inverse=True)
+            which = torch.zeros(size, dtype=torch.long)
+            for level in rows.unbind(2):
+                number = which * (len(self.scene.mask_vectors) + 1) + level + 1
+                which = number.unique(return_inverse=True)[1]
+            sets = rows.new_empty(int(which.max()) + 1, rows.shape[2])
+            sets[which] = rows
             valid = sets >= 0
             vectors = (self.scene.mask_vectors[sets] * valid[..., None]).sum(1)
             means = vectors / valid.sum(1, keepdim=True).clamp_min(1)
-            self._means[index] = means, which.view(size), (rows >= 0).any(2)
+            self._means[index] = means, which, (rows >= 0).any(2)
         means, which, valid = self._means[index]
         return means[which], valid
 
