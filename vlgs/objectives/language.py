@@ -82,7 +82,10 @@ class Language(Objective):
         share = count / valid.numel() if self.pixels == "all" else 1.0
         if self.error == "l1" and isinstance(self.head, Linear):
             views, map_ = self.views, self.head.map
-            wanted = lambda some: views.codes_of(masks[some])  # noqa: E731
+
+            def wanted(some: slice) -> Tensor:
+                return views.codes_of(masks[some])
+
             error = mapped_l1(codes, map_.weight, map_.bias, wanted, share)
         else:
             error = _ERRORS[self.error](self.predict(codes[None]), self.views.codes_of(masks)[None])

@@ -8,7 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from vlgs.heads.rows import BLOCK, in_blocks, linear_gradients
+from vlgs.heads.rows import in_blocks, linear_gradients
+
+_CHUNK = 2048
+"""Pixels whose embeddings are turned into gradients at once: 4 MB of 512, which stay in cache. With fewer, threads wait for each other."""
 
 
 def mapped_l1(
@@ -55,8 +58,8 @@ class _MappedL1(torch.autograd.Function):
         flat[len(codes) :] = 0
         numbers = len(codes) * len(weight)
         totals = []
-        for at in range(0, len(codes), BLOCK):  # a megabyte, which stays in cache
-            some = slice(at, min(at + BLOCK, len(codes)))
+        for at in range(0, len(codes), _CHUNK):
+            some = slice(at, min(at + _CHUNK, len(codes)))
             errors = flat[some].sub_(wanted(some))
             totals.append(errors.abs().sum())
             errors.sign_().mul_(toward / numbers)
