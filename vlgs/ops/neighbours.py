@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 
 _SHIFTS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
 """Places of the eight neighbours in the 3x3 pixels around an inner one."""
-_NUMBERS = 1 << 17
-"""Numbers of the rows that are looked at together: half a megabyte, which stays in cache beside their products."""
+_NUMBERS = 1 << 18
+"""Numbers of the rows that are looked at together, a megabyte: they stay in cache, and are large enough for threads."""
 
 
 def neighbour_products(image: Float[Tensor, "h w c"]) -> Float[Tensor, "8 ih iw"]:

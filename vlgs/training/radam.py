@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.optim.radam import radam
 
-_PART = 1 << 15
-"""Numbers of a part: with their gradients, moments and what is made of them on the way they stay in cache."""
+_PART = 1 << 18
+"""Numbers of a part, a megabyte: large enough for threads, small enough to stay in cache with its gradients and moments."""
 
 
 class RAdam(torch.optim.RAdam):
