@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from vlgs.heads.rows import in_blocks, linear_gradients
 
-_CHUNK = 2048
-"""Pixels whose embeddings are turned into gradients at once: 4 MB of 512, which stay in cache. With fewer, threads wait for each other."""
+_CHUNK = 1024
+"""Pixels whose embeddings are turned into gradients at once: 2 MB of 512, which stay in cache. With fewer, threads wait for each other."""
 
 
 def mapped_l1(
