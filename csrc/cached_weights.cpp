@@ -13,6 +13,9 @@ namespace vlgs {
 namespace {
 
 constexpr int64_t kRowsAtOnce = 64;
+// Gaussians meet the gradients of a block in no order that a cache could follow: so many channels of all
+// blocks of a small view stay in it. A multiple of those that a kernel sums at once.
+constexpr int64_t kChannelsAtOnce = 32;
 
 }  // namespace
 
@@ -92,16 +95,20 @@ void CachedWeights<T>::backward(const T *d_image, int64_t channels, T *d_values,
   if (any_not_finite(d_image, pixels * channels))
     check_rows("gradient of a cached view must be finite", d_image, pixels, channels, -kLargest, kLargest);
   const Kernels<T> &kernel = kernels<T>();
-  const Buffer<T> upstream(blocks * channels * kPixels);
-  for_each(blocks, threads, [&](int64_t block) {
-    kernel.cached_weights_upstream(grid_, block, d_image, channels,
-                                   upstream.data() + block * channels * kPixels);
-  });
-  for_each_in_turn(n_, threads, kRowsAtOnce, [&](int64_t i, int) {
-    const int64_t begin = row_begin_[i];
-    kernel.cached_weights_backward(row_begin_[i + 1] - begin, entries_.data() + begin, blocks_.data() + begin,
-                                   weights_.data(), upstream.data(), channels, d_values + i * channels);
-  });
+  const Buffer<T> upstream(blocks * std::min(channels, kChannelsAtOnce) * kPixels);
+  for (int64_t first = 0; first < channels; first += kChannelsAtOnce) {
+    const int64_t count = std::min(channels - first, kChannelsAtOnce);
+    for_each(blocks, threads, [&](int64_t block) {
+      kernel.cached_weights_upstream(grid_, block, d_image + first, channels, count,
+                                     upstream.data() + block * count * kPixels);
+    });
+    for_each_in_turn(n_, threads, kRowsAtOnce, [&](int64_t i, int) {
+      const int64_t begin = row_begin_[i];
+      kernel.cached_weights_backward(row_begin_[i + 1] - begin, entries_.data() + begin,
+                                     blocks_.data() + begin, weights_.data(), upstream.data(), count,
+                                     d_values + i * channels + first);
+    });
+  }
 }
 
 template class CachedWeights<float>;

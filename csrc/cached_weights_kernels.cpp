@@ -93,12 +93,13 @@ void cached_weights_render(const Grid &grid, int64_t block, int64_t count, const
   }
 }
 
-void cached_weights_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t channels, T *packs) {
+void cached_weights_upstream(const Grid &grid, int64_t block, const T *d_image, int64_t channels,
+                             int64_t count, T *packs) {
   const Corner first = corner(grid, block);
   for (int l = 0; l < kLanes; ++l) {
     const int64_t x = first.x + l % 4, y = first.y + l / 4;
     const bool inside = x < grid.width && y < grid.height;
-    for (int64_t c = 0; c < channels; ++c)
+    for (int64_t c = 0; c < count; ++c)
       packs[c * kLanes + l] = inside ? d_image[(y * grid.width + x) * channels + c] : T(0);
   }
 }

@@ -177,8 +177,8 @@ constexpr int kSlotHead = 8;  // where wide channels begin
 //   is left, -1 where more is left behind all.
 // cache_weights: weights of the first chain of one tile: entries per block, and if `ids` is given the entries
 //   themselves. cached_weights_render: one block of pixels of an image; scratch [channels, kPixels].
-//   cached_weights_upstream, cached_weights_backward: a block of pixels as [channels, kPixels], then the
-//   gradient of one Gaussian's values over its entries.
+//   cached_weights_upstream, cached_weights_backward: the first `count` channels of a block of pixels as
+//   [count, kPixels], then the gradient of as many values of one Gaussian over its entries.
 // attention, attention_backward: Gaussians [begin, end); backward adds to sums over them, one per lane.
 // peak_fma: the fastest that this machine computes: `rounds` times kPeakFmaPacks multiply-adds of 16 lanes,
 //   none of which waits for another of its round.
@@ -200,7 +200,7 @@ constexpr int kSlotHead = 8;  // where wide channels begin
   KERNEL(void, cached_weights_render, const Grid &, int64_t block, int64_t count, const uint32_t *ids,           \
          const T *weights, const T *values, int64_t channels, T *scratch, T *image)                              \
   KERNEL(void, cached_weights_upstream, const Grid &, int64_t block, const T *d_image, int64_t channels,         \
-         T *packs)                                                                                               \
+         int64_t count, T *packs)                                                                                \
   KERNEL(void, cached_weights_backward, int64_t count, const uint32_t *entries, const uint32_t *blocks,          \
          const T *weights, const T *upstream, int64_t channels, T *d_value)                                      \
   KERNEL(int64_t, attention_scratch, const AttentionShape &)                                                     \

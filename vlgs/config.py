@@ -79,6 +79,8 @@ def check_targets(
     plain = {str(key): value for key, value in plain.items() if key != "hydra"}
     for key, meant in unread(plain, name):
         hint = f"; did you mean {' or '.join(meant)}?" if meant else ""
+        if meant and last(meant[0]) == "_target_":
+            hint = f"; {meant[0]} must say whose it is"
         raise ValueError(
             f"config: {key} must be a key that is read, got one that nothing reads{hint}"
         )
@@ -168,7 +170,8 @@ def instantiate(config: Any, **arguments: Any) -> Any:
             given = dict(node) | (arguments if not key else {})
             _require_arguments(_who(config, key, target), made, given)
     try:
-        return instantiate(config, **arguments)
+        # Lists and mappings come as Python's: in OmegaConf's own list a dataclass that was made would be settings again.
+        return instantiate(config, _convert_="partial", **arguments)
     except InstantiationException as error:
         if isinstance(error.__cause__, (ValueError, OSError)):
             raise error.__cause__ from None
@@ -190,11 +193,20 @@ def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, A
         raise ValueError(
             f"{who}: arguments must be those of {made.__name__}, got others ({error})"
         ) from error
-    plain = {k: v for k, v in values.items() if not (isinstance(v, Mapping) and "_target_" in v)}
+    plain = {k: _unmade(v) for k, v in values.items() if not _is_part(v)}
     hints = typing.get_type_hints(made.__init__ if isinstance(made, type) else made)
     # Constructors know their choices, and say them in words of theirs.
     judged = {k: h for k, h in hints.items() if typing.get_origin(h) is not Literal}
     require_types(who, judged, plain)
+
+
+def _is_part(value: Any) -> bool:
+    return isinstance(value, Mapping) and "_target_" in value
+
+
+def _unmade(value: Any) -> Any:
+    """A value without the parts that a list of it has, which are judged when they are made."""
+    return [v for v in value if not _is_part(v)] if isinstance(value, list) else value
 
 
 def _who(config: Any, key: str, target: str) -> str:

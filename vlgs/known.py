@@ -226,6 +226,8 @@ def _unread_in(key: str, node: Any) -> Iterator[tuple[str, list[str]]]:
     for name, child in node.items():
         if name not in known and not (key in OPEN and isinstance(child, Mapping)):
             now, meant = renamed(join(key, name)), near(str(name), known)
+            if target is None and not meant and targets(last(key)):
+                meant = ["_target_"]  # whose keys these are is what is missing
             yield join(key, name), [now] if now else [join(key, other) for other in meant]
         elif key != "gaussians.attributes":  # whose values `vlgs.gaussians.GaussiansConfig` judges
             yield from _unread_in(join(key, name), child)

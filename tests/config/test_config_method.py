@@ -1,5 +1,6 @@
 """A method is a YAML file: an overlay of the axes, and a list of stages."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -8,11 +9,14 @@ from tiny_runs import TINY, composed
 
 from vlgs.config import check_config
 from vlgs.experiment import construct
+from vlgs.fields.hash_grid import GridConfig
+from vlgs.fields.language_field import LanguageConfig
 from vlgs.identity import identity
 from vlgs.known import option, options
 from vlgs.run import run
 from vlgs.runs import RunFolder
 from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.hash_features import TrainHashFeatures
 from vlgs.training.stages import Lift, Train, TrainColor
 
 FEATURES = """# @package _global_
@@ -116,6 +120,62 @@ def test_what_no_method_can_be_is_refused(chosen, overrides: list[str], message:
 
     with pytest.raises(ValueError, match=message):
         refuse()
+
+
+GRID = "_target_: vlgs.fields.hash_grid.GridConfig"
+NUMBERS = "features: 2, coarsest: 4, finest: 16, log2_table: 10"
+
+
+def _with_grids(grids: str) -> DictConfig:
+    """FMGS with these hash grids."""
+    network = (
+        f"{{_target_: vlgs.fields.language_field.LanguageConfig, scaled: false, grids: {grids}}}"
+    )
+    return composed("method=fmgs", f"+stages.1.network={network}")
+
+
+def test_a_list_of_parts_is_constructed_part_by_part():
+    config = _with_grids(f"[{{{GRID}, levels: 4, {NUMBERS}}}, {{{GRID}, levels: 2, {NUMBERS}}}]")
+    check_config(config)
+    method = construct(config).method
+    assert method is not None
+    stage = method.listed[1]
+    assert isinstance(stage, TrainHashFeatures)
+    grids = (GridConfig(4, 2, 4, 16, 10), GridConfig(2, 2, 4, 16, 10))
+    assert stage.network == LanguageConfig(grids, scaled=False)
+    assert asdict(stage.network)["grids"] == tuple(map(asdict, grids))  # as it is saved
+
+
+@pytest.mark.parametrize(
+    ("grids", "message"),
+    [
+        (f"[{{{GRID}, level: 4, {NUMBERS}}}]", r"grids.0.level must be a key that is read, .* did you mean stages.1.network.grids.0.levels\?"),
+        (f"[{{{GRID}, levels: 4, {NUMBERS}}}, {{levels: 4}}]", r"grids.1.levels must be a key that is read, .*; stages.1.network.grids.1._target_ must say whose it is"),
+        (f"[{{{GRID}, {NUMBERS}}}]", "grids: arguments must be those of GridConfig, .*missing a required argument: 'levels'"),
+        (f"[{{{GRID}, levels: 4.5, {NUMBERS}}}]", "grids: levels must be a whole number, got 4.5"),
+        (f"[{{{GRID}, levels: 4, {NUMBERS}}}, 3]", r"network: grids must be a list, each the settings of a GridConfig, got \[3\]"),
+        ("[{_target_: vlgs.fields.language_field.LanguageConfig}]", r"grids.0._target_ must be one of vlgs.fields.hash_grid.GridConfig, got"),
+        ("[{_target_: my_lab.Grid}]", r"grids.0._target_ must be one of .*, got 'my_lab.Grid'; if you trust it, .*plugins=\[my_lab\]"),
+        ("[{_target_: os.system, command: ls}]", r"grids.0._target_ must be one of vlgs.fields.hash_grid.GridConfig, got 'os.system'$"),
+    ],
+)  # fmt: skip
+def test_a_list_of_parts_with_something_else_is_refused(grids: str, message: str):
+    config = _with_grids(grids)
+
+    def refuse() -> None:
+        check_config(config)
+        construct(config)
+
+    with pytest.raises(ValueError, match=message):
+        refuse()
+
+
+def test_keys_of_a_part_that_is_not_there_are_told_so():
+    config = composed("method=fmgs", f"+stages.1.network.grids=[{{{GRID}, levels: 4, {NUMBERS}}}]")
+    with pytest.raises(
+        ValueError, match=r"nothing reads; stages.1.network._target_ must say whose it is"
+    ):
+        check_config(config)
 
 
 @pytest.mark.parametrize("method", options("method"))

@@ -19,7 +19,7 @@ def freeze(splats: RenderScene, config: RasterConfig | None = None, **more: int)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 16, 29])
+@pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 16, 29, 69])
 @pytest.mark.parametrize("stop", ["after", "before"])
 def test_pictures_and_gradients_are_the_rasterizers(dtype: torch.dtype, channels: int, stop: str):
     config = RasterConfig(stop=stop)  # pyright: ignore[reportArgumentType]

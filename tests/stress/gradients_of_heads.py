@@ -16,9 +16,10 @@ from vlgs.heads.identity import Identity
 from vlgs.heads.linear import Linear
 from vlgs.heads.lookup import LookupTable
 from vlgs.heads.quantised import QuantisedCodes, quantiser_loss
-from vlgs.heads.rows import layers, linear_rows
+from vlgs.heads.rows import in_blocks, layers, linear_rows
 from vlgs.objectives import CodebookLanguage, CodeClasses, LookupLanguage
-from vlgs.objectives.lookup import choice_error
+from vlgs.objectives.choice import choose
+from vlgs.objectives.mapped_error import mapped_l1
 from vlgs.objectives.mask_classes import MaskClasses, NeighbourClasses
 
 
@@ -85,6 +86,7 @@ def quantised() -> QuantisedCodes:
 
 HEAD_CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.heads.rows.linear_rows": lambda: (linear_rows, [draw(2, 3, 4), draw(2, 4, seed=1), draw(2, seed=2)]),
+    "vlgs.heads.rows.in_blocks": lambda: (in_blocks, [draw(3, 2)]),
     "vlgs.heads.rows.layers": lambda: (
         partial(layers, nn.Sequential(nn.Linear(3, 4), nn.ReLU(), nn.Linear(4, 2)).double()), [draw(5, 3)]
     ),
@@ -113,8 +115,13 @@ HEAD_CHECKS: dict[str, Callable[[], Check]] = {
         lambda codes: tuple(bound(LookupLanguage(), lookup()).terms(codes, torch.tensor([0, 3, 0, 1]), 2.0).values()),
         [draw(4, 2)],
     ),
-    "vlgs.objectives.lookup.choice_error": lambda: (
-        lambda scores: choice_error(scores, torch.tensor([2, 0, 2])), [draw(3, 4)]
+    "vlgs.objectives.choice.choose": lambda: (
+        lambda codes, weight, bias: choose(codes, weight, bias, torch.tensor([2, 0, 2]), 3.0)[0],
+        [draw(3, 2), draw(4, 2, seed=1), draw(4, seed=2)],
+    ),
+    "vlgs.objectives.mapped_error.mapped_l1": lambda: (
+        lambda codes, weight, bias: mapped_l1(codes, weight, bias, (9 + draw(3, 4, seed=3)).__getitem__, 3.0),
+        [draw(3, 2), draw(4, 2, seed=1), draw(4, seed=2)],
     ),
     "vlgs.objectives.code_classes.CodeClasses.terms": lambda: (
         lambda codes, doubt: bound(CodeClasses(), quantised()).terms(codes, torch.eye(3).double(), doubt),

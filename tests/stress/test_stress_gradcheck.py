@@ -49,6 +49,7 @@ from vlgs.ops.absolute_error import absolute_error
 from vlgs.ops.attention import Token, attend
 from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.depth import at_rows, camera_depth, render_depth
+from vlgs.ops.neighbours import neighbour_products
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
 from vlgs.ops.view_color import view_color
@@ -253,6 +254,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.ops.absolute_error.absolute_error": lambda: (
         absolute_error, [draw(*SIZE), 2 + draw(*SIZE, seed=1)]
     ),
+    "vlgs.ops.neighbours.neighbour_products": lambda: (neighbour_products, [draw(4, 5, 2)]),
     "vlgs.ops.squared_error.squared_error": lambda: both(squared_error, VALID, "all"),
     "vlgs.ops.ssim.ssim_map": lambda: (ops_ssim.ssim_map, [draw(*SIZE), draw(*SIZE, seed=1)]),
     "vlgs.ops.l1_dssim.l1_dssim": lambda: both(ops_l1_dssim.l1_dssim, VALID, 0.3),

@@ -38,6 +38,7 @@ class LanguageConfig:
 
     def __post_init__(self) -> None:
         require_fields("language field", self)
+        object.__setattr__(self, "grids", tuple(self.grids))  # a list, when it comes from YAML
         require_range("language field", 0, 16, hidden=self.hidden)
         require_range("language field", 1, 4096, width=self.width)
         if not self.grids:

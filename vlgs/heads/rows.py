@@ -29,13 +29,33 @@ def linear_rows(
                 [3.5000]])
     """
     flat = rows.reshape(-1, rows.shape[-1])
-    # A batch of one counts as a single product, which may be cut.
-    size = min(BLOCK, math.ceil(max(len(flat), 2) / 2))
-    count = max(2, math.ceil(len(flat) / size))
-    blocks = pad(flat, (0, 0, 0, count * size - len(flat))).unflatten(0, (count, size))
-    batch = weight.T.expand(count, -1, -1)
+    blocks = in_blocks(flat)
+    batch = weight.T.expand(len(blocks), -1, -1)
     made = torch.bmm(blocks, batch) if bias is None else torch.baddbmm(bias, blocks, batch)
     return made.flatten(0, 1)[: len(flat)].reshape(*rows.shape[:-1], len(weight))
+
+
+def in_blocks(rows: Float[Tensor, "n i"]) -> Float[Tensor, "blocks size i"]:
+    """Rows in at least two blocks of one size, with zeros after the last row."""
+    # A batch of one counts as a single product, which may be cut.
+    size = min(BLOCK, math.ceil(max(len(rows), 2) / 2))
+    count = max(2, math.ceil(len(rows) / size))
+    return pad(rows, (0, 0, 0, count * size - len(rows))).unflatten(0, (count, size))
+
+
+def linear_gradients(
+    d_made: Float[Tensor, "blocks size o"],
+    blocks: Float[Tensor, "blocks size i"],
+    weight: Float[Tensor, "o i"],
+) -> tuple[
+    Float[Tensor, "blocks size i"],
+    Float[Tensor, "o i"],
+    Float[Tensor, " o"],
+]:
+    """Gradients by the blocks, the weight and the bias of ``W x + b``, bit for bit those that autograd forms in `linear_rows`."""
+    d_blocks = torch.bmm(d_made, weight.expand(len(blocks), -1, -1))
+    d_weight = torch.bmm(blocks.transpose(1, 2), d_made).sum(0).T
+    return d_blocks, d_weight, d_made.sum((0, 1))
 
 
 def layers(network: nn.Sequential, rows: Float[Tensor, "*b i"]) -> Float[Tensor, "*b o"]:

@@ -6,7 +6,10 @@ from typing import Literal
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vlgs.heads import Head
+from vlgs.heads.linear import Linear
 from vlgs.losses import masked_cosine, masked_l1, masked_mse
+from vlgs.objectives.mapped_error import mapped_l1
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.ops.squared_error import Pixels
@@ -37,10 +40,12 @@ class Language(Objective):
         self.pixels: Pixels = pixels
         self.predict: Callable[[Tensor], Tensor] | None = None
         self.views: TrainingViews | None = None
+        self.head: Head | None = None
 
     def bind(self, setup: Setup) -> None:
         """What is compared is said by the head of the model."""
         self.predict = setup.model.predict
+        self.head = setup.model.head
         # Targets of a head that learns are embeddings: a map of them is large, and most systems that have one leave pixels out.
         self.views = None if setup.model.head.learning_rate is None else setup.views
 
@@ -73,7 +78,15 @@ class Language(Objective):
         count = int(valid.sum())
         if count == 0:
             return feature.sum() * 0
-        codes = feature.view(*valid.shape, -1)[valid]  # [p, d]
-        wanted = self.views.codes_of(target.masks[valid])
-        error = _ERRORS[self.error](self.predict(codes[None]), wanted[None], None)
-        return error * (count / valid.numel()) if self.pixels == "all" else error
+        codes, masks = feature.view(*valid.shape, -1)[valid], target.masks[valid]  # [p, d], [p]
+        share = count / valid.numel() if self.pixels == "all" else 1.0
+        if self.error == "l1" and isinstance(self.head, Linear):
+            views, map_ = self.views, self.head.map
+
+            def wanted(some: slice) -> Tensor:
+                return views.codes_of(masks[some])
+
+            error = mapped_l1(codes, map_.weight, map_.bias, wanted, share)
+        else:
+            error = _ERRORS[self.error](self.predict(codes[None]), self.views.codes_of(masks)[None])
+        return error * share if self.pixels == "all" else error

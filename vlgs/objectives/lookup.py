@@ -7,17 +7,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
-from torch.utils.checkpoint import checkpoint
 
 from vlgs.demands import Demand
 from vlgs.heads.lookup import LookupTable
 from vlgs.heads.rows import linear_rows
+from vlgs.objectives.choice import choose
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import masked_codes
 from vlgs.values import require_range
-
-CHUNK = 2048
-"""Pixels whose scores are held at once: 2.5 MB of 300, which stay in cache."""
 
 
 class LookupLanguage(Objective):
@@ -103,7 +100,8 @@ class LookupLanguage(Objective):
         wanted = normalize(self.views.codes_of(rows), dim=-1)
         cosines = linear_rows(wanted, normalize(self.head.table, dim=-1))  # [masks, rows]
         nearest = cosines.detach().argmax(dim=-1)
-        error, best = self._choose(codes, nearest[which])
+        map_ = self.head.map
+        error, best = choose(codes, map_.weight, map_.bias, nearest[which], self.choice)
         # How often a mask of the view is answered by a row. A sum over pixels would have a gradient that threads add up in any order.
         chosen = torch.bincount(which * size + best, minlength=cosines.numel()).view_as(cosines)
         odds = (temperature * cosines).log_softmax(dim=-1)
@@ -113,29 +111,3 @@ class LookupLanguage(Objective):
             "entropy": -self.entropy * (share @ (odds.exp() * odds).sum(dim=-1)),
             "answer": 1 - (cosines * chosen).sum() / len(masks),
         }
-
-    def _choose(
-        self, codes: Float[Tensor, "p d"], right: Int[Tensor, " p"]
-    ) -> tuple[Float[Tensor, ""], Int[Tensor, " p"]]:
-        """The error of the choice, and the rows that are chosen; the scores of a view would be a hundred megabytes, and are not kept."""
-        parts = [
-            checkpoint(self._choose_some, *some, use_reentrant=False, preserve_rng_state=False)
-            for some in zip(codes.split(CHUNK), right.split(CHUNK), strict=True)
-        ]
-        errors, best = zip(*parts, strict=True)
-        return torch.stack(errors).sum() / (len(codes) * len(self.head.table)), torch.cat(best)
-
-    def _choose_some(
-        self, codes: Float[Tensor, "c d"], right: Int[Tensor, " c"]
-    ) -> tuple[Float[Tensor, ""], Int[Tensor, " c"]]:
-        scores = self.head.predict(codes)
-        return choice_error(scores, right), scores.detach().argmax(dim=-1)
-
-
-def choice_error(scores: Float[Tensor, "p k"], right: Int[Tensor, " p"]) -> Float[Tensor, ""]:
-    """Sum of the squared errors of the softmax and the unit vectors of what is right, ``|s|^2 - 2 s_right + 1``: none of those is made."""
-    odds = scores.log_softmax(
-        dim=-1
-    ).exp()  # the gradient of softmax has other bits on more threads
-    errors = odds.square().sum(dim=-1) - 2 * odds.gather(1, right[:, None])[:, 0] + 1
-    return errors.sum()

@@ -19,6 +19,7 @@ from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.geometry import resize_camera
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.neighbours import neighbour_products
 from vlgs.training.fit_learner import train_learner
 from vlgs.training.language_field import HUBER
 from vlgs.training.learner import Descent, Learner, generator_of
@@ -144,6 +145,7 @@ class HashLearner(Learner):
         self.seen = [index for index, view in enumerate(scene.train) if view.read_masks is not None]
         self._views = CachedViews(settings.skip.kept_bytes)
         self._rows: dict[int, Tensor] = {}
+        self._means: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
         self._seconds: dict[int, Tensor] = {}
 
     def terms(self, draw: int, generator: torch.Generator) -> Mapping[str, Tensor]:
@@ -186,14 +188,24 @@ class HashLearner(Learner):
 
     def _vectors(self, index: int, size: torch.Size) -> tuple[Tensor, Tensor]:
         """Mean vector of the masks of each pixel over the mask levels, and where there is one."""
-        read = self.scene.train[index].read_masks
-        assert read is not None  # `self.seen`
-        rows = read()
-        rows = rows[..., None] if rows.dim() == 2 else rows
-        rows = _nearest(rows, size).long()
-        valid = rows >= 0
-        vectors = self.scene.mask_vectors[rows] * valid[..., None]
-        return vectors.sum(2) / valid.sum(2, keepdim=True).clamp_min(1), valid.any(2)
+        if index not in self._means:
+            read = self.scene.train[index].read_masks
+            assert read is not None  # `self.seen`
+            rows = read()
+            rows = _nearest(rows[..., None] if rows.dim() == 2 else rows, size).long()
+            # Pixels of the same masks have one mean: a view has some hundred.
+            which = torch.zeros(size, dtype=torch.long)
+            for level in rows.unbind(2):
+                number = which * (len(self.scene.mask_vectors) + 1) + level + 1
+                which = number.unique(return_inverse=True)[1]
+            sets = rows.new_empty(int(which.max()) + 1, rows.shape[2])
+            sets[which] = rows
+            valid = sets >= 0
+            vectors = (self.scene.mask_vectors[sets] * valid[..., None]).sum(1)
+            means = vectors / valid.sum(1, keepdim=True).clamp_min(1)
+            self._means[index] = means, which, (rows >= 0).any(2)
+        means, which, valid = self._means[index]
+        return means[which], valid
 
     def _second(self, index: int, size: torch.Size) -> Float[Tensor, "h w c"]:
         if index not in self._seconds:
@@ -235,11 +247,7 @@ def alignment_loss(
 
 def neighbour_cosines(image: Float[Tensor, "h w c"]) -> Float[Tensor, "8 ih iw"]:
     """Cosine of each inner pixel with its eight neighbours."""
-    unit = normalize(image, dim=-1, eps=1e-6)  # once for all pairs
-    h, w, _ = image.shape
-    inner = unit[1 : h - 1, 1 : w - 1]
-    shifts = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
-    return torch.stack([(inner * unit[y : y + h - 2, x : x + w - 2]).sum(-1) for y, x in shifts])
+    return neighbour_products(normalize(image, dim=-1, eps=1e-6))  # once for all pairs
 
 
 def _nearest(rows: Tensor, size: torch.Size) -> Tensor:

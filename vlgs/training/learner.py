@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from vlgs.identity import RESULTS_VERSION
 from vlgs.training.checkpoint import Checkpoint
+from vlgs.training.radam import RAdam
 from vlgs.training.settings import TrainerConfig
 from vlgs.values import require_choice, require_fields, require_range
 
-_OPTIMIZERS = {"adam": torch.optim.Adam, "radam": torch.optim.RAdam}
+_OPTIMIZERS = {"adam": torch.optim.Adam, "radam": RAdam}
 
 
 @dataclass(frozen=True)
