@@ -44,20 +44,27 @@ def _checked_function(fn: Callable[..., Any], typechecker: Any) -> Callable[...,
         if jaxtyping.config.jaxtyping_disable:
             return fn(*args, **kwargs)
         if checked is None:
-            hints = {name: _resolved(hint, fn) for name, hint in fn.__annotations__.items()}
-            sizes_of_arguments = any(
-                "{" in str(hint) for hint in hints.values()
-            )  # jaxtyping alone looks them up
-            if sizes_of_arguments or inspect.isgeneratorfunction(
-                fn
-            ):  # whose arguments beartype checks when it is begun, later
-                checked = _original(fn, typechecker=typechecker)
-            else:
-                checked = beartype(_with_hints(fn, hints))
+            checked = _prepared(fn, typechecker)
+        return checked(*args, **kwargs)
+
+    return wrapper
+
+
+def _prepared(fn: Callable[..., Any], typechecker: Any) -> Callable[..., Any]:
+    """The function that checks a call and does it."""
+    hints = {name: _resolved(hint, fn) for name, hint in fn.__annotations__.items()}
+    named, checked = str([*hints.values()]), beartype(_with_hints(fn, hints))
+    if "jaxtyping." not in named:
+        return checked
+    # A size named after an argument, which jaxtyping looks up; a generator, of which beartype checks the arguments when the call is over.
+    if "{" in named or inspect.isgeneratorfunction(fn):
+        return _original(fn, typechecker=typechecker)
+
+    def with_sizes(*args: Any, **kwargs: Any) -> Any:
         with _sizes_of_a_call:
             return checked(*args, **kwargs)
 
-    return wrapper
+    return with_sizes
 
 
 def _resolved(hint: Any, fn: Callable[..., Any]) -> Any:
