@@ -13,8 +13,9 @@ from collections.abc import Callable
 from typing import Any, get_type_hints
 
 import jaxtyping
-from beartype import beartype
+from beartype import BeartypeConf, beartype
 
+_checking = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
 _original = jaxtyping.jaxtyped
 _sizes_of_a_call = jaxtyping.jaxtyped("context")
 
@@ -53,7 +54,7 @@ def _checked_function(fn: Callable[..., Any], typechecker: Any) -> Callable[...,
 def _prepared(fn: Callable[..., Any], typechecker: Any) -> Callable[..., Any]:
     """The function that checks a call and does it."""
     hints = {name: _resolved(hint, fn) for name, hint in fn.__annotations__.items()}
-    named, checked = str([*hints.values()]), beartype(_with_hints(fn, hints))
+    named, checked = str([*hints.values()]), _checking(_with_hints(fn, hints))
     if "jaxtyping." not in named:
         return checked
     # A size named after an argument, which jaxtyping looks up; a generator, of which beartype checks the arguments when the call is over.
