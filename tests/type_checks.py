@@ -69,11 +69,10 @@ def _prepared(fn: Callable[..., Any], typechecker: Any) -> Callable[..., Any]:
 
 
 def _resolved(hint: Any, fn: Callable[..., Any]) -> Any:
-    """A hint that is written as a string; what only a type checker imports is not checked."""
-    if not isinstance(hint, str):
-        return hint
+    """A hint without strings in it; one with a name that only a static type checker imports is not checked."""
+    alone = types.SimpleNamespace(__annotations__={"hint": hint})
     try:
-        return get_type_hints(types.SimpleNamespace(__annotations__={"hint": hint}), fn.__globals__)["hint"]  # fmt: skip
+        return get_type_hints(alone, fn.__globals__, include_extras=True)["hint"]
     except NameError:
         return Any
 
