@@ -6,23 +6,32 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+import type_checks
+
+if TYPE_CHECKING:
+    from vlgs.types import Scene
+
+type_checks.install()
 
 # Two workers with two threads each on two cores: a thread that waits must not keep the core of one that works. Read when torch is loaded,
 # here and in every process that a test starts.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# While a module of vlgs is imported, jaxtyping looks for compiled files under names of its own, also for all that this module imports: without
-# this, 3 500 modules of other packages would be compiled anew in every worker.
-for _name in ("torch", "torchmetrics", "lightning.pytorch.loggers", "kornia", "matplotlib.pyplot", "pandas", "viser"):  # fmt: skip
-    try:
-        importlib.import_module(_name)
-    except ImportError:  # an extra that is not installed
-        continue
 
-from vlgs.types import Scene  # noqa: E402
+def pytest_configure(config: pytest.Config) -> None:
+    """Import what most tests need, in each process that runs tests; pytest's own, which hands them out, needs none of it."""
+    if config.getoption("dist", "no") != "no" and "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    # While a module of vlgs is imported, jaxtyping looks for compiled files under names of its own, also for all that this module
+    # imports: without this, 3 500 modules of other packages would be compiled anew in every worker.
+    for name in ("torch", "torchmetrics", "lightning.pytorch.loggers", "kornia", "matplotlib.pyplot", "pandas", "viser"):  # fmt: skip
+        try:
+            importlib.import_module(name)
+        except ImportError:  # an extra that is not installed
+            continue
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -64,7 +73,7 @@ def frame_rates_of_few_views() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def tiny_scene() -> Scene:
+def tiny_scene() -> "Scene":
     from vlgs.data.synthetic import load_scene
 
     return load_scene(width=48, height=36, train_views=6, test_views=2, points=400)

@@ -16,7 +16,7 @@ TINY = (
     "data.test_views=2",
     "data.points=400",
     "gaussians.background=0",
-    "head.training.steps=30",
+    "head.training.steps=8",
     "head.cache_dir=null",
     "progress=false",
 )

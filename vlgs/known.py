@@ -117,6 +117,7 @@ def is_ours(target: object) -> bool:
     return any(target in [*names] for names in _schema().targets.values())
 
 
+@cache
 def groups() -> frozenset[str]:
     """Folders of options, without Hydra's own: ``data``, ``features/encoder``."""
     folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")}

@@ -1,8 +1,7 @@
-"""A sample of the attacks of `python -m tests.fuzz`, in a process of its own: one that has computed with threads must not be forked."""
+"""A sample of the attacks of `python -m tests.fuzz`, in children of a process that computes nothing: one that has computed with threads must not be forked."""
 
 import re
-import subprocess
-import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +9,8 @@ import pytest
 
 from tests.fuzz._table import FamilyRow, begun, write_row
 from tests.fuzz.judge import AttackOutcome
+from vlgs.ablate import warm
+from vlgs.ablate.warm import WarmParent
 
 SAMPLES = {
     "files": ("--count", "24"),
@@ -30,25 +31,40 @@ LARGER = {
 }
 
 
-def meet(family: str, options: tuple[str, ...], least: int) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.fuzz", family, *options],
-        cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    tried, right = map(int, re.findall(r"tried +(\d+)  right +(\d+)", done.stdout)[0])
+@pytest.fixture(scope="module")
+def parent() -> Iterator[WarmParent]:
+    """One process that has imported what every family needs; each sample is met in a child of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(Path(__file__).parents[2])
+        patch.setattr(warm, "MODULE", "tests.fuzz")
+        patch.setattr(warm, "SHARED", [f"tests.fuzz.{family}" for family in SAMPLES])
+        parent = WarmParent()
+    yield parent
+    parent.close()
+
+
+def meet(parent: WarmParent, family: str, options: tuple[str, ...], least: int, log: Path) -> None:
+    log.touch()
+    run = parent.start([family, *options], log)
+    assert run is not None
+    run.wait(900.0)
+    said = log.read_text()
+    assert run.returncode == 0, said
+    tried, right = map(int, re.findall(r"tried +(\d+)  right +(\d+)", said)[0])
     assert tried == right > least
 
 
 @pytest.mark.parametrize("family", SAMPLES)
-def test_a_sample_of_the_attacks_is_met_rightly(family: str):
-    meet(family, SAMPLES[family], 4)
+def test_a_sample_of_the_attacks_is_met_rightly(family: str, parent: WarmParent, tmp_path: Path):
+    meet(parent, family, SAMPLES[family], 4, tmp_path / "log")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", LARGER)
-def test_a_larger_sample_of_the_attacks_is_met_rightly(family: str):
-    meet(family, LARGER[family], 10)
+def test_a_larger_sample_of_the_attacks_is_met_rightly(
+    family: str, parent: WarmParent, tmp_path: Path
+):
+    meet(parent, family, LARGER[family], 10, tmp_path / "log")
 
 
 def test_a_family_is_gone_on_with_on_the_same_code_alone(tmp_path: Path):

@@ -243,24 +243,13 @@ def test_help_is_a_manual_and_needs_no_torch():
         assert section in done.stdout
 
 
-def test_a_multirun_makes_one_run_per_combination(tmp_path: Path):
+def test_a_multirun_makes_one_run_per_combination(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     empty = tmp_path / "elsewhere"
     empty.mkdir()
-    done = subprocess.run(
-        command(
-            "-m",
-            *SHORT,
-            "trainer.iterations=3",
-            "blend=none,fixed",
-            f"results={tmp_path}",
-            "pictures=false",
-        ),
-        capture_output=True,
-        text=True,
-        cwd=empty,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(empty)
+    few = ("trainer.iterations=3", "blend=none,fixed", "pictures=false")
+    said = in_process("run", ["-m", *SHORT, *few, f"results={tmp_path}"])
+    assert said.status == 0, said.text
     folders = [RunFolder(path) for path in (tmp_path / "runs").iterdir()]
     assert len(folders) == 2
     assert all(folder.finished() for folder in folders)

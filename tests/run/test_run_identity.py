@@ -1,7 +1,6 @@
 """Runs that are one run: with settings that move nothing, of a class that was moved."""
 
-import os
-import subprocess
+import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import pytest
 from safetensors.numpy import load_file
 from tiny_runs import TINY, composed
 
+from tests.fuzz.commands import command
 from vlgs.run import run
 from vlgs.runs import RunFolder
 
@@ -55,25 +55,24 @@ def test_settings_that_are_no_part_of_an_id_move_nothing(whole: RunFolder, tmp_p
     assert made(again) == made(whole)
 
 
-def test_a_plugin_whose_class_is_moved_has_its_run(tmp_path: Path):
+def test_a_plugin_whose_class_is_moved_has_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     options, lab = tmp_path / "options" / "fusion", tmp_path / "my_lab"
     options.mkdir(parents=True)
     lab.mkdir()
     (lab / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
 
-    def command(module: str) -> str:
+    def told(module: str) -> str:
         (options / "gated.yaml").write_text(f"_target_: my_lab.{module}.Gated\n")
         (lab / f"{module}.py").write_text("from vlgs.fusion.none import NoFusion\n\nclass Gated(NoFusion):\n    pass\n")  # fmt: skip
-        done = subprocess.run(
-            [
-                *(sys.executable, "-m", "vlgs.run", f"--config-dir={tmp_path}/options", "fusion=gated"),
-                *("plugins=[my_lab]", f"results={tmp_path}/results", *SHORT),
-            ],
-            env=os.environ | {"PYTHONPATH": f"{tmp_path}:{Path.cwd()}"}, capture_output=True, text=True,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        importlib.invalidate_caches()
+        given = (f"--config-dir={tmp_path}/options", "fusion=gated", "plugins=[my_lab]")
+        said = command("run", [*given, f"results={tmp_path}/results", *SHORT])
+        assert said.status == 0, said.text
+        for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
+            del sys.modules[name]  # as a new process begins
+        return said.text
 
-    assert "already done" not in command("gate")
+    assert "already done" not in told("gate")
     (lab / "gate.py").unlink()
-    assert "already done" in command("moved")
+    assert "already done" in told("moved")

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from tiny_runs import TINY, composed
 
 import vlgs.fields.language_field
+import vlgs.fields.radiance
 import vlgs.finish
 import vlgs.training.checkpoint
 from vlgs.config import CONF
@@ -35,9 +36,21 @@ SHORT = (
     "pictures=false",
 )
 METHODS = options("method")
-RAYS = ("+stages.0.rays=256", "+stages.0.batches=1", "+stages.1.rays=256")
-SHORTER = {"lerf": (*RAYS, "stages.1.scales=2"), "opennerf": RAYS}
-"""Method -> what makes it quick, where an iteration takes long."""
+RAYS = (
+    *("+stages.0.rays=256", "+stages.0.batches=1", "+stages.1.rays=256"),
+    "+stages.0.radiance={_target_: vlgs.fields.radiance.RadianceConfig, coarse: 32, samples: 8}",
+    *("data.width=24", "data.height=18"),
+)
+SHORTER = {
+    "lerf": (
+        *RAYS,
+        "stages.1.scales=2",
+        "+stages.1.network={_target_: vlgs.fields.language_field.LanguageConfig, width: 32}",
+    ),
+    "opennerf": (*RAYS, "+stages.1.network.width=32"),
+    "legaussians": ("head.quantiser.steps=50",),
+}
+"""Method -> what makes it quick, where an iteration, a view or the fit of the head takes long."""
 
 
 def short(*overrides: str) -> DictConfig:
@@ -88,6 +101,7 @@ class Runner:
             return HashGrid(replace(config, log2_table=8), generator)
 
         monkeypatch.setattr(vlgs.fields.language_field, "HashGrid", small)
+        monkeypatch.setattr(vlgs.fields.radiance, "HashGrid", small)
         monkeypatch.setattr(vlgs.finish, "report", reporting)
         monkeypatch.setattr(vlgs.training.checkpoint, "write_atomically", writing)
 

@@ -55,7 +55,7 @@ def measure(full: bool) -> dict[str, list[str]]:
                 results = [tensors_of(*render_with_gradients(scene)) for scene in scenes]
                 pictures.append(digest([t for result in results for t in result]))
             for _ in range(5 if full else 1):
-                trainings.append(_train(200 if full else 24))
+                trainings.append(_train(200 if full else 12))
     finally:
         torch.set_num_threads(before)
     return {"pictures": pictures, "trainings": trainings}

@@ -27,7 +27,7 @@ from vlgs.training.fit import FitOptions, fit
 from vlgs.training.lightning import VLGSModule
 from vlgs.types import ChannelGroup, Scene
 
-TINY = ("head.training.steps=30", "head.cache_dir=null", "trainer=smoke")
+TINY = ("head.training.steps=8", "head.cache_dir=null", "trainer=smoke")
 RATES = ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits", "indicator_logits",
          "features", "fusion")  # fmt: skip
 
