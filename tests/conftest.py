@@ -8,13 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jaxtyping
 import pytest
-import type_checks
 
 if TYPE_CHECKING:
     from vlgs.types import Scene
-
-type_checks.install()
 
 # Two workers with two threads each on two cores: a thread that waits must not keep the core of one that works. Read when torch is loaded,
 # here and in every process that a test starts.
@@ -70,6 +68,20 @@ def frame_rates_of_few_views() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finish, "measure_fps", functools.partial(finish.measure_fps, seconds=0.0))
         yield
+
+
+WHOLE_RUNS = frozenset(
+    {"bench", "export", "fuzz", "opened", "query", "render", "run", "stress", "view"}
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def types_are_checked_in_parts(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Checks of types and shapes take two fifths of a training run: where whole runs are tested they are off, tests of their parts have them."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in WHOLE_RUNS)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture(scope="session")
