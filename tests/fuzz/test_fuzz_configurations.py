@@ -22,7 +22,7 @@ AT_ONCE = {
     "trainr=photos": "trainr must be a key, got one that is not there; did you mean trainer?",
     "+trainr=photos": "trainr must be a key that is read, got one that nothing reads; did you mean trainer?",
     "+trainer.iteration=100": "did you mean trainer.iterations?",
-    "trainer=phots": "trainer must be one of .* did you mean photos?",
+    "trainer=phots": "trainer must be one of .* did you mean photos or fast_photos?",
     "trainer=base": "trainer must be one of",
     "data.rot=": "did you mean data.root?",
     "data.root=x": "data=colmap or .* has it",
