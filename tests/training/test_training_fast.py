@@ -1,5 +1,7 @@
 """What ``trainer=fast`` does: small views at first, large steps that slow down."""
 
+import gc
+import weakref
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -9,6 +11,7 @@ import torch
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
+from vlgs.objectives.targets import TrainingViews
 from vlgs.runs import RunFolder
 from vlgs.training.build import Parts, build_module
 from vlgs.training.fit import FitOptions, fit
@@ -56,9 +59,11 @@ def test_where_no_shape_is_learned_all_views_keep_their_size(tiny_scene: Scene):
 
 def test_views_are_small_in_the_first_half(tiny_scene: Scene, tmp_path: Path):
     sizes: list[set[tuple[int, int]]] = []
+    seen: list[weakref.ref[TrainingViews]] = []
 
     def each(module: VLGSModule) -> None:
         report = module.report
+        seen.append(weakref.ref(module.step.bound.views))
         sizes.append({(camera.width, camera.height) for camera in report.cameras})
         images = [render.color for render in report.renders]
         assert all(
@@ -66,10 +71,13 @@ def test_views_are_small_in_the_first_half(tiny_scene: Scene, tmp_path: Path):
             for i, p in zip(images, report.photographs, strict=True)
         )
 
-    trained(tiny_scene, tmp_path, *LESS, each=each)
+    module = trained(tiny_scene, tmp_path, *LESS, each=each)
+    assert seen[-1]() is module.views
     whole = tiny_scene.train[0].camera
     small = ((whole.width + 1) // 2, (whole.height + 1) // 2)
     assert sizes == [{small}] * 8 + [{(whole.width, whole.height)}] * 8
+    gc.collect()
+    assert seen[0]() is None  # what it had read is given up
 
 
 @pytest.mark.parametrize("stop", [5, 8, 11])

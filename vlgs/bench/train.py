@@ -53,7 +53,6 @@ LEVERS: dict[str, tuple[str, ...]] = {
     ),
     "rates that stay": ("trainer.color_decay=1",),
     "whole views": ("trainer.half_size=0",),
-    "default's threshold": ("gaussians.densify.grad_threshold=6.0e-4",),
     "harmonics a twentieth": ("trainer.learning_rates.shN=1.5e-3",),
 }
 """What ``trainer=fast`` is without one of its parts."""

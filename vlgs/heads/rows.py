@@ -5,6 +5,7 @@ a sum over all rows, then depends on their number. A batch of equal products is 
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -41,6 +42,15 @@ def in_blocks(rows: Float[Tensor, "n i"]) -> Float[Tensor, "blocks size i"]:
     size = min(BLOCK, math.ceil(max(len(rows), 2) / 2))
     count = max(2, math.ceil(len(rows) / size))
     return pad(rows, (0, 0, 0, count * size - len(rows))).unflatten(0, (count, size))
+
+
+def for_error(
+    gradients: Sequence[Tensor], toward: Float[Tensor, ""], d_error: Float[Tensor, ""]
+) -> list[Tensor]:
+    """Gradients that were formed where ``toward`` is the gradient by the error, for another one. For the same one they stay as they are, to the bit."""
+    if torch.equal(d_error, toward):
+        return [*gradients]
+    return [gradient * (d_error / toward) for gradient in gradients]
 
 
 def linear_gradients(

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from vlgs.heads.rows import in_blocks, linear_gradients
+from vlgs.heads.rows import for_error, in_blocks, linear_gradients
 
 CHUNK = 2048
 """Pixels whose scores are turned into gradients at once: 2.5 MB of 300, which stay in cache. With fewer, threads wait for each other."""
@@ -69,10 +69,7 @@ class _Choice(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         *made, toward = ctx.saved_tensors
-        d_error = grad_outputs[0]
-        if not torch.equal(d_error, toward):
-            made = [gradient * (d_error / toward) for gradient in made]
-        d_codes, d_weight, d_bias = made
+        d_codes, d_weight, d_bias = for_error(made, toward, grad_outputs[0])
         return d_codes, None, d_weight, d_bias, None
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from vlgs.heads.rows import in_blocks, linear_gradients
+from vlgs.heads.rows import for_error, in_blocks, linear_gradients
 
 _CHUNK = 1024
 """Pixels whose embeddings are turned into gradients at once: 2 MB of 512, which stay in cache. With fewer, threads wait for each other."""
@@ -71,7 +71,4 @@ class _MappedL1(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         *made, toward = ctx.saved_tensors
-        d_error = grad_outputs[0]
-        if not torch.equal(d_error, toward):
-            made = [gradient * (d_error / toward) for gradient in made]
-        return *made, None, None
+        return *for_error(made, toward, grad_outputs[0]), None, None

@@ -85,20 +85,15 @@ class TrainingStep:
         self.bound = self.setup
         """What the objectives look at."""
 
-    @cached_property
-    def half_setup(self) -> Setup:
-        """The same at half the width and height."""
-        return replace(self.setup, views=self.setup.views.at_half_size())
-
     def views(self, step: int) -> TrainingViews:
-        """What an iteration sees, shown to the objectives where it is not what the last one saw."""
+        """What an iteration sees; where that is of another size than before, objectives are shown it, and what the other size kept is given up."""
         small = self.settings.is_half_size(step) and not has_frozen_shape(self.model)
-        setup = self.half_setup if small else self.setup
-        if setup is not self.bound:
-            for objective in setup.objectives.values():
-                objective.bind(setup)
-            self.bound = setup
-        return setup.views
+        if small != (self.bound is not self.setup):
+            whole = self.setup
+            self.bound = replace(whole, views=whole.views.at_half_size()) if small else whole
+            for objective in self.bound.objectives.values():
+                objective.bind(self.bound)
+        return self.bound.views
 
     @cached_property
     def needs(self) -> frozenset[str]:
