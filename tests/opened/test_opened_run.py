@@ -226,3 +226,22 @@ def test_files_are_plain_tensors_for_others(finished: Path):
     tensors = load_file(RunFolder(finished).field)
     assert tensors["splats.means"].shape[1] == 3
     json.dumps(decode(RunFolder(finished).field, FORM).meta)
+
+
+PHOTOGRAPHS = Path(__file__).parents[1] / "fixtures" / "photographs"
+
+
+def test_photographs_without_language_are_looked_at_and_not_asked(tmp_path: Path):
+    silent = ("data=colmap", f"data.root={PHOTOGRAPHS}", "data.resize=0.25")
+    config = composed(
+        *silent, "trainer=smoke", "trainer.iterations=3", "progress=false", f"results={tmp_path}"
+    )
+    assert run(config) == 0
+    opened = open_run(next((tmp_path / "runs").iterdir()), within=0.01)
+    assert not opened.field.has_language
+    camera = opened.cameras("test")[0].camera
+    color = opened.field.render(camera, frozenset({"color"})).color
+    assert color is not None
+    assert color.shape == (camera.height, camera.width, 3)
+    with pytest.raises(ValueError, match="cannot be asked for words"):
+        opened.ask(["mug"])

@@ -120,4 +120,4 @@ class Unite:
     def _united(self, progress: Progress, level: int | None, language: bool) -> SplatField:
         color = progress.gaussians(self.color, level)
         both = unite(color, progress.gaussians(self.language, level)) if language else color
-        return SplatField(both)
+        return SplatField(both, language=language)

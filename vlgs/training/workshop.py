@@ -171,7 +171,8 @@ class Workshop:
     def _remember(
         self, name: str, module: VLGSModule, color: bool = True, kept: bool = True
     ) -> SplatField:
-        folder, field = self.folder.part(name), SplatField(module.model, color)
+        folder = self.folder.part(name)
+        field = SplatField(module.model, color, language=module.views.has_language)
         size, seconds = checkpoint_bytes(folder.checkpoint), module.train_seconds
         self.made[name] = Made(folder, field, module.model.count, seconds, module.skips, size, kept)
         return field
