@@ -178,7 +178,9 @@ def test_keys_of_a_part_that_is_not_there_are_told_so():
         check_config(config)
 
 
-RELEASED = [name for name in options("method") if name != "best"]  # which is ours, with rates of its own
+RELEASED = [
+    name for name in options("method") if name != "best"
+]  # which is ours, with rates of its own
 
 
 @pytest.mark.parametrize("method", RELEASED)
