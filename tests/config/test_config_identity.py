@@ -39,7 +39,7 @@ that it moves nothing."""
 NAMES = {
     "augment": "none offline",
     "blend": "beta fixed gaussian none uniform",
-    "head": "autoencoder classifier codebook identity linear lookup quantised",
+    "head": "autoencoder classifier codebook identity linear lookup principal quantised",
     "data": "colmap synthetic",
     "encoder": "clip maps",
     "fusion": "cross mlp none self",
@@ -50,7 +50,7 @@ NAMES = {
     "raster": "default",
     "segmenter": "sam superpixels",
     "sharing": "pos_cov",
-    "lift": "direction mean robust squared top_k",
+    "lift": "consensus direction mean robust solve squared top_k",
     "stages": "associate lift train train_color train_hash_features train_language_field train_radiance",
     "text": "clip vocabulary",
     "trainer": "base",

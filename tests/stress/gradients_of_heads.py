@@ -15,6 +15,7 @@ from vlgs.heads.codebook import Codebook
 from vlgs.heads.identity import Identity
 from vlgs.heads.linear import Linear
 from vlgs.heads.lookup import LookupTable
+from vlgs.heads.principal import Principal
 from vlgs.heads.quantised import QuantisedCodes, quantiser_loss
 from vlgs.heads.rows import in_blocks, layers, linear_rows
 from vlgs.objectives import CodebookLanguage, CodeClasses, LookupLanguage
@@ -84,6 +85,13 @@ def quantised() -> QuantisedCodes:
     return made.double()
 
 
+def principal() -> Principal:
+    """Of embeddings of five numbers; codes shorter than `sure`, and drawn gently."""
+    made = Principal(dim=2, entries=2, sharpness=2.0, sure=1.0).double()
+    made.fit(draw(6, 5), torch.ones(6))
+    return made
+
+
 HEAD_CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.heads.rows.linear_rows": lambda: (linear_rows, [draw(2, 3, 4), draw(2, 4, seed=1), draw(2, seed=2)]),
     "vlgs.heads.rows.in_blocks": lambda: (in_blocks, [draw(3, 2)]),
@@ -95,6 +103,9 @@ HEAD_CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.heads.codebook.Codebook.decode": lambda: codebook("decode"),
     "vlgs.heads.lookup.LookupTable.targets": lambda: (LookupTable(2, 3, 4).targets, [draw(4, 4)]),
     "vlgs.heads.lookup.LookupTable.predict": lambda: (LookupTable(2, 3, 4).double().predict, [draw(4, 2)]),
+    "vlgs.heads.principal.Principal.targets": lambda: (principal().targets, [draw(4, 5)]),
+    "vlgs.heads.principal.Principal.predict": lambda: (principal().predict, [draw(4, 2)]),
+    "vlgs.heads.principal.Principal.decode": lambda: (principal().decode, [0.1 * draw(4, 2)]),
     "vlgs.heads.quantised.QuantisedCodes.predict": lambda: (QuantisedCodes(2, 3, 4, [5]).double().predict, [draw(4, 2)]),
     "vlgs.heads.quantised.QuantisedCodes.decode": lambda: (quantised().decode, [draw(4, 2)]),
     "vlgs.heads.quantised.quantiser_loss": lambda: (

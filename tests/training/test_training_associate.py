@@ -31,7 +31,7 @@ def sums_of(dense: Sequence[Sequence[float]]) -> MaskWeights:
     """From a row per Gaussian and a column per mask."""
     table = torch.tensor(dense, dtype=torch.float32)
     gaussian, mask = table.nonzero().T
-    return MaskWeights(gaussian, mask, table[gaussian, mask], len(table))
+    return MaskWeights(gaussian, mask, table[gaussian, mask], torch.zeros(len(table)))
 
 
 def test_masks_of_the_same_gaussians_are_one_object():

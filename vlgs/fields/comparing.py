@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from vlgs.fields.similarity import SMALLEST_NORM, decoded_cosines, require_one_space, unit_words
-from vlgs.heads import Head
+from vlgs.heads import Head, lengths_count
 from vlgs.heads.folded import Foldable, Folded
 from vlgs.ops.code_table import LANES, Looked, code_table
 from vlgs.values import require_range
@@ -60,7 +60,9 @@ class Decoding:
         self, codes: Float[Tensor, "h w d"], words: Float[Tensor, "k e"]
     ) -> Float[Tensor, "k h w"]:
         """See `Comparing`."""
-        return decoded_cosines(self.head.decode, codes, words)
+        return decoded_cosines(
+            self.head.decode, codes, words, least=_least(lengths_count(self.head))
+        )
 
 
 class Folding:
@@ -91,12 +93,18 @@ class Folding:
         basis = self.folded.basis
         require_one_space(len(basis), words.shape[-1])
         asked = unit_words(words.to(codes.dtype)) @ basis
+        least = _least(self.folded.lengths_count)
         out = codes.new_empty(len(words), len(codes))
         for start in range(0, len(codes), _CHUNK):
             made = self.folded.coordinates(codes[start : start + _CHUNK])
-            lengths = torch.linalg.vector_norm(made, dim=-1).clamp_min(SMALLEST_NORM)
+            lengths = torch.linalg.vector_norm(made, dim=-1).clamp_min(least)
             torch.div(asked @ made.T, lengths, out=out[:, start : start + _CHUNK])
         return out
+
+
+def _least(lengths_count: bool) -> float:
+    """By what products with shorter embeddings are divided."""
+    return 1.0 if lengths_count else SMALLEST_NORM
 
 
 @dataclass

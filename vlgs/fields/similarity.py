@@ -45,10 +45,17 @@ def require_one_space(features: int, text: int) -> None:
         )
 
 
-def cosines(features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"]) -> Float[Tensor, " k *p"]:
+def cosines(
+    features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"], least: float = SMALLEST_NORM
+) -> Float[Tensor, " k *p"]:
     """Cosine of every text vector with every feature; a zero vector has cosine 0 with everything.
 
     The product is taken first and divided by the norms after, which spares a normalised copy of the features.
+
+    Args:
+        features: Of any length.
+        text: Likewise.
+        least: Features shorter than this are divided by it: their cosines fade to 0 with their length.
 
     Raises:
         ValueError: If text and features have different widths.
@@ -59,7 +66,7 @@ def cosines(features: Float[Tensor, "*p e"], text: Float[Tensor, "k _"]) -> Floa
     """
     require_one_space(features.shape[-1], text.shape[-1])
     flat = features.reshape(-1, features.shape[-1])
-    norms = torch.linalg.vector_norm(flat, dim=-1).clamp_min(SMALLEST_NORM)  # [p]
+    norms = torch.linalg.vector_norm(flat, dim=-1).clamp_min(least)  # [p]
     products = unit_words(text.to(flat.dtype)) @ flat.T  # [k, p]
     return (products / norms).reshape(text.shape[0], *features.shape[:-1])
 
@@ -69,6 +76,7 @@ def decoded_cosines(
     codes: Float[Tensor, "h w d"],
     text: Float[Tensor, "k e"],
     chunk: int = CHUNK,
+    least: float = SMALLEST_NORM,
 ) -> Float[Tensor, "k h w"]:
     """Cosine of every text vector with every pixel of a rendered map of language codes.
 
@@ -80,13 +88,14 @@ def decoded_cosines(
         codes: Rendered, not normalised.
         text: Text vectors in the embedding space of the decoder.
         chunk: Pixels per call of `decode`.
+        least: See `cosines`.
     """
     h, w, _ = codes.shape
     flat = codes.reshape(h * w, -1)
     unit = unit_words(text.to(codes.dtype))
     out = codes.new_empty(text.shape[0], h * w)
     for start in range(0, h * w, chunk):
-        out[:, start : start + chunk] = cosines(decode(flat[start : start + chunk]), unit)
+        out[:, start : start + chunk] = cosines(decode(flat[start : start + chunk]), unit, least)
     return out.reshape(-1, h, w)
 
 

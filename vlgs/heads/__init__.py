@@ -42,8 +42,16 @@ class Head(Protocol):
         ...
 
     def decode(self, codes: Float[Tensor, "*b d"]) -> Float[Tensor, "*b e"]:
-        """Unit embeddings of codes, which may be blends of several."""
+        """Unit embeddings of codes, which may be blends of several; see `lengths_count` for shorter ones."""
         ...
+
+
+def lengths_count(head: Head) -> bool:
+    """Whether the length of an embedding, at most 1, says how sure a head is of it: words are compared by products, which fade with it.
+
+    Heads that say so have ``lengths_count: ClassVar[bool] = True``; all others are compared by cosines.
+    """
+    return getattr(head, "lengths_count", False) is True
 
 
 @runtime_checkable

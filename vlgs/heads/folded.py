@@ -22,6 +22,8 @@ class Folded:
     """Orthonormal columns."""
     coordinates: Callable[[Float[Tensor, "p d"]], Float[Tensor, "p r"]]
     """Of the embeddings of codes, in this basis, before they are brought to unit length."""
+    lengths_count: bool = False
+    """See `vlgs.heads.lengths_count`."""
 
 
 @runtime_checkable

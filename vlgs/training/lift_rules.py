@@ -12,9 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from vlgs.fields.splat import SplatModel
 from vlgs.ops.pixel_weights import PixelWeights
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.mask_weights import MaskWeights, Share, by_rank, mask_weights
+from vlgs.types import Scene
 from vlgs.values import require_range
 
 GAUSSIANS = 4096
@@ -42,6 +44,30 @@ class LiftRule(Protocol):
         ...
 
 
+@runtime_checkable
+class Refining(Protocol):
+    """A rule that goes on from the codes that it made of sums, with renders of the views."""
+
+    def refine(
+        self,
+        model: SplatModel,
+        scene: Scene,
+        level: int,
+        vectors: Float[Tensor, "m t"],
+        start: Float[Tensor, "n t"],
+    ) -> Float[Tensor, "n t"]:
+        """Codes of all Gaussians.
+
+        Args:
+            model: Whose Gaussians.
+            scene: Whose masks.
+            level: Place of the mask level.
+            vectors: Targets of the masks.
+            start: From `LiftRule.combine`.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Mean:
     """``sum w H / sum w`` (LUDVIG, Marrie et al., ICCV 2025; Occam's LGS, Cheng et al., 2024, where the centre's pixel stands for all)."""
@@ -51,6 +77,30 @@ class Mean:
     def combine(self, sums: MaskWeights, vectors: Float[Tensor, "m t"]) -> Float[Tensor, "n t"]:
         """See `LiftRule`."""
         total = sums.totals()
+        return sums.sums(vectors) / total.clamp_min(torch.finfo(total.dtype).tiny)
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """``sum w H / (sum w + absent sum' w)``, the second sum over pixels without a mask: what all that see a Gaussian say of it.
+
+    The length of a code is how far its views agree, and that they say something at all: a mask that was missed in some views shortens the code of its
+    thing and turns it nowhere, and what hardly any mask shows, as a sky, has next to none. `vlgs.heads.principal.Principal` answers by it.
+
+    Raises:
+        ValueError: If `absent` is not in [0, 1].
+    """
+
+    share: ClassVar[Share | None] = None
+    absent: float = 1.0
+    """What a pixel without a mask counts beside one with; 0: nothing, as in `Mean`."""
+
+    def __post_init__(self) -> None:
+        require_range("consensus", 0, 1, absent=self.absent)
+
+    def combine(self, sums: MaskWeights, vectors: Float[Tensor, "m t"]) -> Float[Tensor, "n t"]:
+        """See `LiftRule`."""
+        total = sums.totals() + self.absent * sums.unmasked[:, None]
         return sums.sums(vectors) / total.clamp_min(torch.finfo(total.dtype).tiny)
 
 
@@ -173,8 +223,10 @@ def lift_by(rule: LiftRule, module: VLGSModule) -> None:
     """Set the codes of a module's Gaussians to what a rule makes of the masks of its scene, in place."""
     model, scene = module.model, module.views.scene
     vectors = model.head.targets(scene.mask_vectors.to(model.splats["features"]))
-    codes = [
-        rule.combine(mask_weights(model, scene, level, rule.share), vectors)
-        for level in range(model.levels)
-    ]
+    codes = []
+    for level in range(model.levels):
+        made = rule.combine(mask_weights(model, scene, level, rule.share), vectors)
+        if isinstance(rule, Refining):
+            made = rule.refine(model, scene, level, vectors, made)
+        codes.append(made)
     model.splats["features"].copy_(torch.cat(codes, dim=1))

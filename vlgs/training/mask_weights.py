@@ -13,10 +13,13 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from vlgs.fields.splat import SplatModel
+from vlgs.objectives.targets import covered
 from vlgs.ops.pixel_weights import PixelWeights, pixel_weights
 from vlgs.ops.project import project
 from vlgs.types import Scene, View
 
+UNSEEN = -2
+"""In place of a mask's row, where a photograph shows nothing."""
 CHANNELS = 64
 """Masks whose sums are formed in one pass over the tiles."""
 
@@ -33,8 +36,13 @@ class MaskWeights:
     """Row of `Scene.mask_vectors`."""
     weight: Float[Tensor, " z"]
     """Above 0."""
-    gaussians: int
-    """How many there are."""
+    unmasked: Float[Tensor, " n"]
+    """Of every Gaussian over the pixels that no mask of its view has; pixels that a photograph does not cover are none of these."""
+
+    @property
+    def gaussians(self) -> int:
+        """How many there are."""
+        return len(self.unmasked)
 
     def sums(
         self, vectors: Float[Tensor, "m t"], weight: Float[Tensor, " z"] | None = None
@@ -73,12 +81,16 @@ def mask_weights(
     weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
     found: list[Tensor] = []
     values: list[Tensor] = []
+    unmasked = torch.zeros_like(weight)
     for view, index in masked_views(scene, level):
+        if (seen := covered(view)) is not None:
+            index = torch.where(seen | (index >= 0), index, UNSEEN)
         numbers, local = torch.unique(index, return_inverse=True)
         if share is None:
             sums = _by_backward(model, view, weight, local, len(numbers))
         else:
             sums = _one_by_one(model, view, weight, local, len(numbers), share)
+        unmasked += sums[:, (numbers < 0) & (numbers != UNSEEN)].sum(1)
         sums[:, numbers < 0] = 0
         pairs = sums.nonzero()
         found.append(torch.stack([pairs[:, 0], numbers[pairs[:, 1]].long()]))
@@ -86,7 +98,7 @@ def mask_weights(
     pairs = torch.cat(found, dim=1) if found else torch.zeros(2, 0, dtype=torch.long)
     summed = torch.cat(values) if values else weight.new_zeros(0)
     order = (pairs[0] * max(1, len(scene.mask_vectors)) + pairs[1]).argsort(stable=True)
-    return MaskWeights(pairs[0][order], pairs[1][order], summed[order], model.count)
+    return MaskWeights(pairs[0][order], pairs[1][order], summed[order], unmasked)
 
 
 def masked_views(scene: Scene, level: int = 0) -> Iterator[tuple[View, Int[Tensor, "h w"]]]:

@@ -1,0 +1,114 @@
+"""Language as a linear system, against the dense weights of the reference in float64."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_training_lift_rules import dense_weights
+from tiny_runs import composed
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from vlgs.config import instantiate
+from vlgs.fields.splat import SplatModel
+from vlgs.training.lift_rules import Consensus, Mean
+from vlgs.training.lift_solve import Solve, conjugate_gradients
+from vlgs.training.mask_weights import mask_weights, masked_views
+from vlgs.types import Scene
+
+pytest_plugins = ["test_training_lift_rules"]
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene: Scene) -> Scene:
+    """Two views; a photograph that shows nothing in its first rows, where there are masks only here and there."""
+    first, second = tiny_scene.train[:2]
+    seen = torch.ones(second.camera.height, second.camera.width, dtype=torch.bool)
+    seen[:9] = False
+    return replace(tiny_scene, train=(first, replace(second, read_valid=lambda: seen)))
+
+
+def system(model: SplatModel, scene: Scene, absent: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of all pixels [p, n], which mask each shows, and how much it counts."""
+    indices = [index for _, index in masked_views(scene)]
+    trust = []
+    for view, index in zip(scene.train, indices, strict=True):
+        there = view.read_valid() if view.read_valid is not None else torch.ones_like(index)
+        trust.append(torch.where(index >= 0, 1.0, absent * there))
+    index = torch.cat([one.flatten() for one in indices])
+    return torch.cat(dense_weights(model, scene)), index, torch.cat([t.flatten() for t in trust])
+
+
+def vectors_of(scene: Scene) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    rows = torch.randn(len(scene.mask_vectors), 5, dtype=torch.float64, generator=generator)
+    return normalize(rows, dim=1)
+
+
+@pytest.mark.parametrize("absent", [0.0, 0.4, 1.0])
+def test_consensus_is_the_mean_over_all_that_see_a_gaussian(
+    model: SplatModel, scene: Scene, absent: float
+):
+    vectors = vectors_of(scene)
+    weights, index, trust = system(model, scene, absent)
+    targets = vectors[index.clamp_min(0).long()] * (index >= 0)[:, None]
+    total = (weights * trust[:, None]).sum(0)[:, None]
+    want = torch.where(total > 0, weights.T @ targets / total, 0)
+    got = Consensus(absent).combine(mask_weights(model, scene), vectors)
+    torch.testing.assert_close(got, want.nan_to_num(), rtol=1e-5, atol=1e-5)
+    assert not got[7].any(), "what no view sees says nothing"
+    if absent == 0:
+        assert torch.equal(got, Mean().combine(mask_weights(model, scene), vectors))
+    else:
+        assert (got.norm(dim=1) <= 1 + 1e-9).all()
+
+
+@pytest.mark.parametrize(("absent", "prior"), [(1.0, 0.1), (0.3, 0.5)])
+def test_enough_steps_solve_the_system(
+    model: SplatModel, scene: Scene, absent: float, prior: float
+):
+    vectors = vectors_of(scene)
+    weights, index, trust = system(model, scene, absent)
+    targets = vectors[index.clamp_min(0).long()] * (index >= 0)[:, None]
+    start = Consensus(absent).combine(mask_weights(model, scene), vectors)
+    normal = weights.T @ (trust[:, None] * weights)
+    held = prior * torch.diag(normal.sum(1))
+    right = weights.T @ (trust[:, None] * targets) + held @ start
+    want = torch.linalg.lstsq(normal + held, right, driver="gelsd").solution
+    solver = Solve(absent, steps=40, prior=prior)
+    got = solver.refine(model, scene, 0, vectors, start)
+    torch.testing.assert_close(weights @ got, weights @ want, rtol=1e-4, atol=1e-4)
+    assert not got[7].any()
+
+    def cost(codes: Tensor) -> float:
+        error = (trust[:, None] * (weights @ codes - targets).square()).sum()
+        return float(error + (torch.diag(held)[:, None] * (codes - start).square()).sum())
+
+    costs = [
+        cost(replace(solver, steps=n).refine(model, scene, 0, vectors, start)) for n in range(5)
+    ]
+    assert costs == sorted(costs, reverse=True), "every step comes closer"
+    assert cost(want) < costs[4] < 0.95 * costs[0]
+
+
+def test_conjugate_gradients_solve_as_many_unknowns_in_as_many_steps():
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(6, 6, dtype=torch.float64, generator=generator)
+    matrix = root @ root.T + 0.1 * torch.eye(6, dtype=torch.float64)
+    right = torch.randn(6, 3, dtype=torch.float64, generator=generator)
+    right[:, 1] = 0  # solved from the start
+    scale = 1 / matrix.diagonal()[:, None]
+    start = torch.zeros_like(right)
+    got = conjugate_gradients(lambda x: matrix @ x, right, scale, start, 6)
+    torch.testing.assert_close(got, torch.linalg.solve(matrix, right))
+    assert torch.equal(conjugate_gradients(lambda x: matrix @ x, right, scale, start, 0), start)
+
+
+def test_options_are_the_defaults():
+    for name, rule in {"consensus": Consensus(), "solve": Solve()}.items():
+        assert instantiate(composed("method=lift", f"lift={name}").lift) == rule
+    assert instantiate(composed("method=best").lift) == Solve()
+    with pytest.raises(ValueError, match=r"consensus: absent must be 0 to 1, got 1\.5"):
+        Consensus(absent=1.5)
+    with pytest.raises(ValueError, match="solve: prior must be"):
+        Solve(prior=0.0)
