@@ -88,10 +88,10 @@ def test_evaluation_is_not_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(curve.time, "perf_counter", lambda: float(next(clock)))
     right = curve.score
 
-    def slow(trained):
+    def slow(*trained):
         for _ in range(100):
             next(clock)
-        return right(trained)
+        return right(*trained)
 
     monkeypatch.setattr(curve, "score", slow)
     scenes = {"synthetic": (*train.QUICK, "trainer.iterations=4")}

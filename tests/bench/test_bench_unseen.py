@@ -17,7 +17,7 @@ from vlgs.bench.unseen_row import UnseenRow
 
 def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command = ["unseen", "--quick", "--scenes", "mirrors_sky", "--out", str(tmp_path)]
-    short = ["--override", "trainer.iterations=6", "data.cache=null"]
+    short = ["--override", "trainer.iterations=6", "data.cache=null", "head.training.steps=8"]
     assert main([*command, *short]) == 0
     table = read_record(tmp_path / "unseen.csv")
     assert list(table.scene) == ["mirrors_sky"]
@@ -27,9 +27,28 @@ def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     header = (tmp_path / "unseen.csv").read_text().splitlines()
     assert {"# commit", "# cpu", "# command"} <= {line.partition(":")[0] for line in header}
 
-    monkeypatch.setattr(unseen, "fit", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(unseen, "run_stages", lambda *_: pytest.fail("trained again"))
     assert main([*command, *short]) == 0
     assert len(read_record(tmp_path / "unseen.csv")) == 1
+
+
+def test_methods_of_several_stages_are_measured_too(tmp_path: Path):
+    command = [
+        "unseen",
+        "--quick",
+        "--scenes",
+        "mirrors_sky",
+        "--views",
+        "4",
+        "--out",
+        str(tmp_path),
+    ]
+    few = ["trainer.iterations=6", "data.cache=null"]
+    assert main([*command, "--recipe", "best", "--override", "method=best", *few]) == 0
+    (row,) = read_record(tmp_path / "unseen.csv").itertuples()
+    assert row.recipe == "best"
+    assert 0 <= float(row.miou) <= 1  # type: ignore[arg-type]
+    assert main([*command, "--recipe", "lerf", "--override", "method=lerf", *few]) == 1
 
 
 def test_spread_is_over_seeds_and_worst_over_views():

@@ -9,6 +9,7 @@ import lightning as L  # noqa: N812 (its own abbreviation)
 
 from vlgs.bench.presets import Trained
 from vlgs.bench.quality import score
+from vlgs.fields.trained import SplatField
 from vlgs.training.after_step import AfterStep, TrainedModule
 from vlgs.training.lightning import VLGSModule
 
@@ -55,7 +56,11 @@ class Curve(AfterStep):
         self.cpu += time.process_time() - self.started[1]
         if module.next_step not in self.at:
             return
-        scores = score(self.trained)
+        scores = score(
+            self.trained.experiment,
+            self.trained.scene,
+            SplatField(self.trained.module.model),
+        )
         self.points.append(
             CurvePoint(
                 self.trained.scene.name, self.label, module.next_step, self.wall, self.cpu,

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import torch
 
 from vlgs.bench.presets import Trained
+from vlgs.experiment import Experiment
+from vlgs.fields import Field
 from vlgs.fields.trained import SplatField
 from vlgs.report.evaluate import Evaluation, evaluate
-from vlgs.types import RasterConfig
+from vlgs.types import RasterConfig, Scene
 
 
 @dataclass(frozen=True)
@@ -23,14 +25,12 @@ class Quality:
     miou_change: float | None = None
 
 
-def score(trained: Trained) -> Evaluation:
+def score(experiment: Experiment, scene: Scene, field: Field) -> Evaluation:
     """The evaluation that ends `python -m vlgs.run`, without its pictures."""
-    experiment, scene = trained.experiment, trained.scene
     text = None
     if scene.classes and scene.mask_vectors.shape[0] > 0 and scene.vocabulary is not None:
         text = experiment.make_text(vocabulary=scene.vocabulary)
     with torch.no_grad():
-        field = SplatField(trained.module.model)
         return evaluate(field, scene, experiment.query, text, experiment.protocol)
 
 
@@ -48,7 +48,7 @@ def _scores_with(trained: Trained, raster: RasterConfig) -> tuple[float | None, 
     before = copy(model.raster)
     model.raster = raster
     try:
-        evaluation = score(trained)
+        evaluation = score(trained.experiment, trained.scene, SplatField(model))
     finally:
         model.raster = before
     return evaluation.psnr, evaluation.miou

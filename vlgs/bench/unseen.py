@@ -11,16 +11,19 @@ from typing import Any, cast
 import torch
 
 from vlgs.bench.lonely import share_lonely
-from vlgs.bench.presets import Trained, build, composed
+from vlgs.bench.presets import composed
 from vlgs.bench.quality import score
 from vlgs.bench.record import provenance, read_record, say, show, write_record
 from vlgs.bench.unseen_draw import draw_unseen
 from vlgs.bench.unseen_row import UnseenRow
 from vlgs.experiment import construct
+from vlgs.fields.trained import SplatField
 from vlgs.identity import RESULTS_VERSION
+from vlgs.prepare import Prepared, make_workshop, prepare
 from vlgs.report.provenance import commit
 from vlgs.runs import RunFolder
-from vlgs.training.fit import FitOptions, fit
+from vlgs.training.stages import run_stages
+from vlgs.training.workshop import StoppedError
 
 PROCEDURAL = ("glassware_ring", "mirrors_sky", "lookalikes_wall")
 """In a room, under a sky, before a plain wall."""
@@ -29,7 +32,7 @@ PHOTOGRAPHS = ("fox", "dtu_scan65", "camvid_0016E5")
 """Folders below `--root`; a folder that is not there is left out."""
 HELD_OUT = 8
 SIZE = ("data.width=120", "data.height=90")
-QUICK = ("data.width=48", "data.height=36", "data.points=400", "head.training.steps=30", "trainer=smoke")  # fmt: skip
+QUICK = ("data.width=48", "data.height=36", "data.points=400", "trainer=smoke")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -112,33 +115,50 @@ def _row(
     known: Mapping[str, UnseenRow],
 ) -> UnseenRow | None:
     """Train and score, unless a row of this run is known."""
-    given = ["head.cache_dir=null", *task.overrides, *overrides]
-    given += [f"seed={seed}", f"threads={threads}", "progress=false"]
-    experiment = construct(composed(given))
-    scene = experiment.read_scene()
-    run = experiment.run_id(scene.fingerprint)
-    if run in known:
+    given = [*task.overrides, *overrides, f"seed={seed}", f"threads={threads}", "progress=false"]
+    config = composed(given)
+    if "cache_dir" in config.head:
+        config.head.cache_dir = None  # its fit is part of the time
+    ready = prepare(construct(config))
+    if ready.run_id in known:
         return None
     started = time.process_time()
-    trained = Trained(experiment, scene, build(experiment, scene))
-    with tempfile.TemporaryDirectory() as folder:
-        if fit(trained.module, RunFolder(Path(folder)), FitOptions({}, progress=False)) is not None:
-            raise KeyboardInterrupt
+    field = _train(ready)
     seconds = time.process_time() - started
-    scores = score(trained)
+    scene = ready.scene
+    scores = score(ready.experiment, scene, field)
     assert scores.psnr is not None
     assert scores.ssim is not None
     views = {name: float(view["psnr"] or 0.0) for name, view in scores.per_view.items()}
     worst = min(views, key=lambda name: views[name])
     lerf = scores.beside.get("miou_lerf_ovs")
     row = UnseenRow(
-        task.scene, task.split, label, seed, run, RESULTS_VERSION, commit(), scores.psnr, views[worst], worst,
-        scores.ssim, scores.miou, None if lerf is None else float(lerf), share_lonely(trained.module.model, scene),
-        trained.module.model.count, seconds,
+        task.scene, task.split, label, seed, ready.run_id, RESULTS_VERSION, commit(), scores.psnr, views[worst], worst,
+        scores.ssim, scores.miou, None if lerf is None else float(lerf), share_lonely(field.model, scene),
+        field.model.count, seconds,
     )  # fmt: skip
     say(f"{task.scene}, {task.split}, {label}, seed {seed}: {row.psnr:.2f} dB, worst {row.worst:.2f}, "
         f"mIoU {row.miou}, {row.gaussians} Gaussians, {seconds:.0f} s of CPU")  # fmt: skip
     return row
+
+
+def _train(ready: Prepared) -> SplatField:
+    """All stages of a run, in a folder that goes again.
+
+    Raises:
+        ValueError: If what it makes is not Gaussians of one model.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        workshop = make_workshop(RunFolder(Path(folder)), ready)
+        try:
+            field = run_stages(ready.experiment.stages(), ready.scenes, workshop).field()
+        except StoppedError as stop:
+            raise KeyboardInterrupt from stop
+    if not isinstance(field, SplatField):
+        raise ValueError(
+            f"bench: a recipe must make Gaussians of one model, got {type(field).__name__}"
+        )
+    return field
 
 
 def _middle_tenth(overrides: Sequence[str]) -> list[str]:
