@@ -39,10 +39,28 @@ def pixel_rays(
     return camera_center(pose).numpy()[:, None], direction
 
 
-def photograph(world: World, camera: Camera) -> TracedImage:
+def exposures(stops: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    """What the values of photographs are multiplied by, as a camera with automatic exposure does.
+
+    The gains are even steps from ``-stops`` to ``stops`` in a random order, divided by their mean: it is exactly 1, as with the maps
+    that `trainer.exposure` learns and as a model without maps fits photographs best, so that a scene that explains them all is the one
+    that photographs of nominal exposure show. They multiply values as displayed, which is what pictures here are made of: on a
+    screen with a gamma of 2.2 a gain of one stop is 2.2 stops of light.
+    """
+    steps = (2 * rng.permutation(count) + 1) / count - 1
+    gains = 2.0 ** (stops * steps)
+    return gains / gains.mean()
+
+
+def photograph(world: World, camera: Camera, gain: float = 1.0) -> TracedImage:
     """Trace one ray per pixel, then four more for every pixel that differs from a neighbour.
 
     Edges are smooth that way, and flat areas cost one ray. Labels are those of the pixel's centre and never averaged.
+
+    Args:
+        world: What is photographed.
+        camera: From where.
+        gain: What its values are multiplied by; those above 1 are lost.
     """
     width, height = camera.width, camera.height
     y, x = (axis.ravel() + 0.5 for axis in np.indices((height, width)).astype(np.float64))
@@ -54,7 +72,7 @@ def photograph(world: World, camera: Camera) -> TracedImage:
     more = trace(world, origin, fine).color.reshape(3, rough.size, -1).sum(-1)
     color = seen.color.copy()
     color[:, rough] = (color[:, rough] + more) / (1 + dx.size)
-    image = np.round(color.T * 255).astype(np.uint8)
+    image = np.round(np.minimum(gain * color.T, 1.0) * 255).astype(np.uint8)
     shape = (height, width)
     return TracedImage(
         image.reshape(*shape, 3),
