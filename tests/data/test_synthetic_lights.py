@@ -163,8 +163,8 @@ def test_a_light_and_an_exposure_are_keys_of_a_file_and_of_what_is_like_it(tmp_p
     assert find_scene("sunroom_even").light == sunny.light != LAMP
     assert (sunny.exposure, find_scene("sunroom_even").exposure) == (0.4, 0)
     path = tmp_path / "mine.yaml"
-    path.write_text("like: rows\nlight: {at: [0, 0, 1.5], radius: 0.3}\nexposure: 1\n")
+    path.write_text("like: rows\nlight: {at: [-2.25, 2.25, 1.85], radius: 0.3}\nexposure: 1\n")
     mine = find_scene(str(path))
     assert mine.exposure == 1
-    assert (mine.light.center, mine.light.power) == ((0.0, 0.0, 1.5), LAMP.power)
+    assert (mine.light.center, mine.light.power) == ((-2.25, 2.25, 1.85), LAMP.power)
     assert mine.light.on_things

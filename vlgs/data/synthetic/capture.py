@@ -102,21 +102,8 @@ def _open(settings: SceneSettings, cache: Path | None) -> Capture:
 def _photographs(
     world: World, cameras: list[Camera], settings: SceneSettings, cache: Path | None
 ) -> list[TracedImage]:
-    rng = np.random.default_rng([_EXPOSURE, settings.seed])
-    gains = np.ones(len(cameras))  # held-out photographs, which come last, are of nominal exposure
-    if settings.scene.exposure:
-        gains[: settings.train_views] = exposures(
-            settings.scene.exposure, settings.train_views, rng
-        )
-
-    def taken() -> list[TracedImage]:
-        return [
-            photograph(world, camera, gain)
-            for camera, gain in zip(cameras, gains.tolist(), strict=True)
-        ]
-
     if cache is None:
-        return taken()
+        return _taken(world, cameras, settings)
     file = cache / f"capture-{settings.fingerprint(level=0)}.npz"
     names = [field.name for field in fields(TracedImage)]
     try:
@@ -127,13 +114,20 @@ def _photographs(
         pass
     except (OSError, ValueError) as error:
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
-    photos = taken()
+    photos = _taken(world, cameras, settings)
     content = io.BytesIO()
     stacks = {name: np.stack([getattr(photo, name) for photo in photos]) for name in names}
     np.savez(content, **stacks)  # pyright: ignore[reportArgumentType] (names are not allow_pickle)
     cache.mkdir(parents=True, exist_ok=True)
     write_atomically(file, content.getvalue())
     return photos
+
+
+def _taken(world: World, cameras: list[Camera], settings: SceneSettings) -> list[TracedImage]:
+    rng = np.random.default_rng([_EXPOSURE, settings.seed])
+    gains = exposures(settings.scene.exposure, settings.train_views, rng).tolist()
+    gains += [1.0] * settings.test_views  # held-out photographs come last
+    return [photograph(world, *taken) for taken in zip(cameras, gains, strict=True)]
 
 
 def regions(

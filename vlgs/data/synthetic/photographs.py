@@ -40,12 +40,13 @@ def pixel_rays(
 
 
 def exposures(stops: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
-    """What the values of photographs are multiplied by, as a camera with automatic exposure does.
+    """What the values of training photographs are multiplied by, as a camera with automatic exposure does.
 
-    The gains are even steps from ``-stops`` to ``stops`` in a random order, divided by their mean: it is exactly 1, as with the maps
-    that `trainer.exposure` learns and as a model without maps fits photographs best, so that a scene that explains them all is the one
-    that photographs of nominal exposure show. They multiply values as displayed, which is what pictures here are made of: on a
-    screen with a gamma of 2.2 a gain of one stop is 2.2 stops of light.
+    The gains are even steps between ``-stops`` and ``stops`` in a random order, divided by their mean, which is 1 from then on. The maps
+    that `trainer.exposure` learns are the identity on average too, and without maps the mean is what squared errors are smallest
+    for: either way the scene that explains the photographs best is the one that photographs of nominal exposure show. The gains
+    multiply values as displayed, of which pictures here are made and which the maps multiply too; with a gamma of 2.2, a stop of these
+    is 2.2 stops of light.
     """
     steps = (2 * rng.permutation(count) + 1) / count - 1
     gains = 2.0 ** (stops * steps)

@@ -12,7 +12,7 @@ from vlgs.data.synthetic.lights import Light, light_on_table
 from vlgs.data.synthetic.objects import OTHER, TRANSLUCENT_REFLECTIVE, Thing
 from vlgs.data.synthetic.outdoors import STAGES
 from vlgs.data.synthetic.parts import Colors, read_color, read_part
-from vlgs.data.synthetic.room import CEILING, LAMP, ROOM, TABLE_RADIUS
+from vlgs.data.synthetic.room import LAMP, TABLE_RADIUS
 from vlgs.data.untrusted.nodes import Node, read_yaml
 
 _FOLDER = Path(__file__).parent
@@ -21,8 +21,8 @@ SCENES = tuple(sorted(path.stem for path in (_FOLDER / "scenes").glob("*.yaml"))
 MOST_PARTS = 240
 """Of a scene with all its things: one byte numbers them, those of the surroundings too."""
 _KEYS = ("like", "stage", "light", "exposure", "colors", "props", "objects", "hard")
-_REACH, _LOWEST = ROOM - 0.05, 0.3
-"""Of a light: how far from the table's middle to each side, and its least height above the table."""
+_SPANS = ((-2.25, 2.25), (-2.25, 2.25), (0.3, 1.85))
+"""Where in the room a light may be: x, y and z."""
 RESERVED = ("wooden table", "wall", "tiled floor", "sky", *NEGATIVES)
 """Classes of the surroundings, and the words that every question is compared with."""
 
@@ -129,11 +129,8 @@ def _read_scene(node: Node, name: str) -> SceneFile:
 
 def _light(node: Node) -> Light:
     entries = node.entries(("at", "radius", "power", "ambient"), ("at", "radius"))
-    low, high = (-_REACH, -_REACH, _LOWEST), (_REACH, _REACH, CEILING - 0.05)
-    x, y, z = (
-        item.number(least, most)
-        for item, least, most in zip(entries["at"].items(3, 3), low, high, strict=True)
-    )
+    items = entries["at"].items(3, 3)
+    x, y, z = (item.number(*span) for item, span in zip(items, _SPANS, strict=True))
     shares = {key: entries[key].number(0, 1) for key in ("power", "ambient") if key in entries}
     given = {"power": LAMP.power, "ambient": LAMP.ambient} | shares
     return light_on_table((x, y, z), entries["radius"].number(0.01, 0.6), **given)

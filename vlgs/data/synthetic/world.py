@@ -114,7 +114,7 @@ class World:
         return share
 
     def counted_share(self, origin: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
-        """Aim at points of the lamp, past the parts that lie on the way to any of them; glass dims a ray, all else stops it."""
+        """Share of the lamp that reaches each of any points: rays to it are dimmed by glass and stopped by all else."""
         goals = self.light.points().T
         through = np.ones((origin.shape[1], goals.shape[1]))
         blocked = self._between(origin)
@@ -150,9 +150,9 @@ class World:
         return near
 
     def _shade(self, half: float, height: float, casters: Sequence[int]) -> Shade:
-        """Look from every grid point at the points of the lamp; glass dims it, all else stops it.
+        """Look from every grid point at the points of the lamp.
 
-        `casters` are those of the lamp at the ceiling, which has nothing behind it.
+        Only `casters` stand between them under the lamp at the ceiling.
         """
         steps = np.linspace(-half, half, _SHADOW_CELLS)
         x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
