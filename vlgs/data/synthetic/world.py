@@ -116,15 +116,23 @@ class World:
     def counted_share(self, origin: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
         """Share of the lamp that reaches each of any points: rays to it are dimmed by glass and stopped by all else."""
         goals = self.light.points().T
-        through = np.ones((origin.shape[1], goals.shape[1]))
+        along, squared = apply(origin.T, goals), (origin * origin).sum(0)[:, None]
+        length2 = squared - 2 * along + (goals * goals).sum(0)
+        through = np.ones(along.shape)
         blocked = self._between(origin)
         for number in self._casters:
             points = np.flatnonzero(blocked[number])
-            row, goal = np.nonzero(through[points] > 0)
+            center = self._bound_centers[number][None]
+            # Squared distance of the sphere's centre from a ray, times the squared length of the ray.
+            off = apply(center, origin.take(points, axis=1)).T - squared[points]
+            ahead = apply(center, goals) - off - along[points]
+            apart2 = (center * center).sum() - 2 * off - squared[points]
+            near = (apart2 - self._bound_radii2[number]) * length2[points] <= ahead * ahead
+            row, goal = np.nonzero(near & (through[points] > 0))
             row = points[row]
             start = origin.take(row, axis=1)
             direction = goals.take(goal, axis=1) - start
-            length = np.sqrt((direction**2).sum(0))
+            length = np.sqrt((direction * direction).sum(0))
             t, _ = self._intersect(number, start, direction / length, np.zeros(row.size))
             glass = self.parts[number].material.kind == "glass"
             hit = t < length
