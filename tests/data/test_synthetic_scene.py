@@ -44,7 +44,17 @@ def scene() -> Scene:
 
 
 @pytest.mark.parametrize(
-    "name", ["glassware", "mirrors", "lookalikes", "patchwork", "wirework", "rows", "smallware"]
+    "name",
+    [
+        "glassware",
+        "mirrors",
+        "lookalikes",
+        "patchwork",
+        "wirework",
+        "rows",
+        "smallware",
+        "sunroom",
+    ],
 )
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
 def test_every_scene_loads(name, difficulty):

@@ -116,7 +116,7 @@ def test_table_is_darker_beside_a_ball_on_the_far_side_of_the_lamp():
     white = Material(Plain((1.0, 1.0, 1.0), grain=0.0))
     world = room(Thing("ball", (Part(sphere(0.1), white, (0.0, 0.0, 0.1)),)))
     shade = next(iter(world.shades.values()))
-    lamp = np.array(LAMP[:2])
+    lamp = np.array(LAMP.center[:2])
     away = -lamp / np.linalg.norm(lamp)
     points = np.stack([[*(0.08 * away), 0.0], [*(-0.4 * away), 0.0]], axis=1)
     np.testing.assert_allclose(shade.at(points), [0.0, 1.0], atol=0.02)

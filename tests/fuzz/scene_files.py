@@ -13,6 +13,8 @@ from vlgs.data.synthetic.scene_file import SCENES
 GOOD = """\
 like: mirrors
 stage: ring
+light: {at: [1.2, -0.5, 1.1], radius: 0.3, power: 0.7, ambient: 0.4}
+exposure: 0.5
 colors: {teal: [0.1, 0.5, 0.5]}
 props:
   egg_cup:

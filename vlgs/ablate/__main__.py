@@ -54,6 +54,7 @@ SCENES = {
         "wirework",
         "rows",
         "smallware",
+        "sunroom",
     ),
     "lerf_ovs": ("ramen", "teatime", "figurines", "waldo_kitchen"),
     "ovs3d": ("bed", "bench", "room", "sofa", "lawn"),

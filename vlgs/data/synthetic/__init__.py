@@ -16,6 +16,9 @@ What each scene tests.
 * ``wirework``: things of wire, one to four pixels wide. Most of what a pixel shows lies behind what it is of.
 * ``rows``: the same thing several times, and others of nearly its shape and colour between.
 * ``smallware``: things of a dozen pixels. Most of every picture is surroundings.
+* ``sunroom``: low light from a window at one side. Soft shadows of things lie across other things, so that one thing has two brightnesses
+  and an edge where there is none; and training photographs are unequally exposed, held-out ones are not (`photographs.exposures`).
+  ``sunroom_even`` is the same, photographed at one exposure.
 
 The first four also come seen from elsewhere, as scenes of their own (`outdoors`): ``glassware_ring`` in the room, from a ring around the table;
 ``glassware_sky`` from such a ring under a sky that has neither points nor masks; ``glassware_wall`` from an arc before a plain wall without
@@ -31,8 +34,8 @@ table, wall and floor are classes too, but only what stands on the table is aske
 mIoU of 0.70 to 0.74 (easy) and 0.47 to 0.54 (hard) against the truth: a model that scores higher has won it from
 the agreement of views.
 
-What the scenes do not show. Glass does not refract; light is one lamp without interreflection; shadows fall on table and
-floor only; there is no lens, no exposure change, no motion blur, no pose error. Textures are smooth and shapes are
+What the scenes do not show. Glass does not refract; light is one lamp without interreflection; but for ``sunroom``, shadows fall on
+table and floor only and all photographs are equally exposed; there is no lens, no motion blur, no pose error. Textures are smooth and shapes are
 quadrics, boxes and rings. Words have no synonyms and images no context: vectors know the class, a piece's own drift, an
 offset and noise. Fault rates are round numbers, not measurements of SAM or CLIP. A method that wins here has passed a test of
 mechanism; numbers compare with each other and with nothing that was measured on photographs.

@@ -13,7 +13,7 @@ from jaxtyping import Int
 from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
 from vlgs.data.synthetic.layouts import build
 from vlgs.data.synthetic.masks import LEVELS, NO_NOISE, Region
-from vlgs.data.synthetic.photographs import TracedImage, photograph
+from vlgs.data.synthetic.photographs import TracedImage, exposures, photograph
 from vlgs.data.synthetic.settings import SceneSettings
 from vlgs.data.synthetic.world import World
 from vlgs.data.untrusted.arrays import Archive
@@ -22,7 +22,7 @@ from vlgs.types import IGNORE_ID, Camera
 
 log = logging.getLogger(__name__)
 
-_LAYOUT, _WALK = 100, 101  # purposes of draws; `masks` and `scene` have others
+_LAYOUT, _WALK, _EXPOSURE = 100, 101, 103  # purposes of draws; `masks` and `scene` have others
 _PATCHES = 1 << 16
 
 
@@ -63,7 +63,7 @@ def _open(settings: SceneSettings, cache: Path | None) -> Capture:
     things = build(
         settings.scene, settings.difficulty, np.random.default_rng([_LAYOUT, settings.seed])
     )
-    world = World(things)
+    world = World(things, settings.scene.light)
     classes = tuple(dict.fromkeys(thing.name for thing in things if thing.masked))
     class_of_thing = np.array(
         [classes.index(thing.name) if thing.masked else IGNORE_ID for thing in things], np.uint8
@@ -103,7 +103,7 @@ def _photographs(
     world: World, cameras: list[Camera], settings: SceneSettings, cache: Path | None
 ) -> list[TracedImage]:
     if cache is None:
-        return [photograph(world, camera) for camera in cameras]
+        return _taken(world, cameras, settings)
     file = cache / f"capture-{settings.fingerprint(level=0)}.npz"
     names = [field.name for field in fields(TracedImage)]
     try:
@@ -114,13 +114,20 @@ def _photographs(
         pass
     except (OSError, ValueError) as error:
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
-    photos = [photograph(world, camera) for camera in cameras]
+    photos = _taken(world, cameras, settings)
     content = io.BytesIO()
     stacks = {name: np.stack([getattr(photo, name) for photo in photos]) for name in names}
     np.savez(content, **stacks)  # pyright: ignore[reportArgumentType] (names are not allow_pickle)
     cache.mkdir(parents=True, exist_ok=True)
     write_atomically(file, content.getvalue())
     return photos
+
+
+def _taken(world: World, cameras: list[Camera], settings: SceneSettings) -> list[TracedImage]:
+    rng = np.random.default_rng([_EXPOSURE, settings.seed])
+    gains = exposures(settings.scene.exposure, settings.train_views, rng).tolist()
+    gains += [1.0] * settings.test_views  # held-out photographs come last
+    return [photograph(world, *taken) for taken in zip(cameras, gains, strict=True)]
 
 
 def regions(

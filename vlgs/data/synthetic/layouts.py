@@ -21,5 +21,5 @@ def build(scene: SceneFile, difficulty: str, rng: np.random.Generator) -> tuple[
         dx, dy, turned = (rng.uniform(-1, 1, 3) * (0.01, 0.01, 12.0)).tolist()
         things.append(place(spot.thing, spot.x + dx, spot.y + dy, spot.degrees + turned))
     if scene.stage in ("room", "ring"):
-        return (*things, table(), wall(), floor())
+        return (*things, table(), wall(scene.light), floor())
     return (*things, table(), *surroundings(scene.stage, FLOOR))

@@ -39,10 +39,29 @@ def pixel_rays(
     return camera_center(pose).numpy()[:, None], direction
 
 
-def photograph(world: World, camera: Camera) -> TracedImage:
+def exposures(stops: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    """What the values of training photographs are multiplied by, as a camera with automatic exposure does.
+
+    The gains are even steps between ``-stops`` and ``stops`` in a random order, divided by their mean, which is 1 from then on. The maps
+    that `trainer.exposure` learns are the identity on average too, and without maps the mean is what squared errors are smallest
+    for: either way the scene that explains the photographs best is the one that photographs of nominal exposure show. The gains
+    multiply values as displayed, of which pictures here are made and which the maps multiply too; with a gamma of 2.2, a stop of these
+    is 2.2 stops of light.
+    """
+    steps = (2 * rng.permutation(count) + 1) / count - 1
+    gains = 2.0 ** (stops * steps)
+    return gains / gains.mean()
+
+
+def photograph(world: World, camera: Camera, gain: float = 1.0) -> TracedImage:
     """Trace one ray per pixel, then four more for every pixel that differs from a neighbour.
 
     Edges are smooth that way, and flat areas cost one ray. Labels are those of the pixel's centre and never averaged.
+
+    Args:
+        world: What is photographed.
+        camera: From where.
+        gain: What its values are multiplied by; those above 1 are lost.
     """
     width, height = camera.width, camera.height
     y, x = (axis.ravel() + 0.5 for axis in np.indices((height, width)).astype(np.float64))
@@ -54,7 +73,7 @@ def photograph(world: World, camera: Camera) -> TracedImage:
     more = trace(world, origin, fine).color.reshape(3, rough.size, -1).sum(-1)
     color = seen.color.copy()
     color[:, rough] = (color[:, rough] + more) / (1 + dx.size)
-    image = np.round(color.T * 255).astype(np.uint8)
+    image = np.round(np.minimum(gain * color.T, 1.0) * 255).astype(np.uint8)
     shape = (height, width)
     return TracedImage(
         image.reshape(*shape, 3),

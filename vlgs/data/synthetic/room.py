@@ -1,8 +1,11 @@
-"""The room that a table stands in, the table, and the lamp.
+"""The room that a table stands in, the table, and its lamp.
 
 World axes: z up, the table top is z = 0, metres. Most cameras stand on the side of negative y.
 """
 
+import numpy as np
+
+from vlgs.data.synthetic.lights import Light
 from vlgs.data.synthetic.objects import Material, Part, Thing
 from vlgs.data.synthetic.patterns import Bands, Cells, Plain, Wood
 from vlgs.data.synthetic.shapes import Box, cylinder
@@ -13,8 +16,8 @@ ROOM = 2.3
 """Half the side of the square room."""
 CEILING = 1.9
 
-LAMP = (0.45, -0.75, CEILING - 0.06)
-"""Centre of the lamp: the light of every shade, shadow and highlight."""
+LAMP = Light((0.45, -0.75, CEILING - 0.06), 0.26)
+"""The lamp under the ceiling, for scenes that have none of their own."""
 
 
 def table() -> Thing:
@@ -31,8 +34,8 @@ def table() -> Thing:
     )
 
 
-def wall() -> Thing:
-    """Four walls with a darker lower half, a bright window behind most cameras, and the ceiling with its lamp."""
+def wall(light: Light = LAMP) -> Thing:
+    """Four walls with a darker lower half, a bright window behind most cameras, the ceiling, and the lamp."""
     bottom = FLOOR - 0.1  # under the floor, so that no two surfaces coincide
     middle, half = (CEILING + bottom) / 2, (CEILING - bottom) / 2
     border = 0.25
@@ -40,12 +43,14 @@ def wall() -> Thing:
         ((0.40, 0.52, 0.54), (0.84, 0.81, 0.73)), 9.0, start=border - middle - 9.0, scale=0.8
     )
     white = Material(Plain((1.0, 1.0, 0.97), grain=0.0), "light")
+    behind = np.array(light.center) + 0.01 * np.array(light.axes)[:, 2]
+    x, y, z = behind.tolist()
     return Thing(
         "wall",
         (
             Part(Box((ROOM, ROOM, half)), Material(paint), (0.0, 0.0, middle)),
             Part(Box((0.55, 0.03, 0.45)), white, (-0.5, -ROOM, 0.95)),
-            Part(cylinder(0.28, 0.03), white, (LAMP[0], LAMP[1], CEILING - 0.05)),
+            Part(cylinder(light.radius + 0.02, 0.03), white, (x, y, z), light.axes),
         ),
         background=True,
     )

@@ -41,7 +41,7 @@ def load_scene(
 
     Args:
         scene: ``glassware``, ``mirrors``, ``lookalikes`` or ``patchwork``; with ``_ring``, ``_sky`` or ``_wall`` after it, seen from there;
-            ``wirework``, ``rows`` or ``smallware``. Or the path of a scene file of your own (conf/data/README.md).
+            ``wirework``, ``rows``, ``smallware``, ``sunroom`` or ``sunroom_even``. Or the path of a scene file of your own (conf/data/README.md).
         difficulty: ``easy``, or ``hard``: half as many things again, occlusion, about twice the faults.
         width: Pixels.
         height: Pixels; the field of view is fixed horizontally.

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlgs.data.synthetic.language import NEGATIVES
+from vlgs.data.synthetic.lights import Light, light_on_table
 from vlgs.data.synthetic.objects import OTHER, TRANSLUCENT_REFLECTIVE, Thing
 from vlgs.data.synthetic.outdoors import STAGES
 from vlgs.data.synthetic.parts import Colors, read_color, read_part
-from vlgs.data.synthetic.room import TABLE_RADIUS
+from vlgs.data.synthetic.room import LAMP, TABLE_RADIUS
 from vlgs.data.untrusted.nodes import Node, read_yaml
 
 _FOLDER = Path(__file__).parent
@@ -19,6 +20,9 @@ SCENES = tuple(sorted(path.stem for path in (_FOLDER / "scenes").glob("*.yaml"))
 """Names of the scenes that come with the package."""
 MOST_PARTS = 240
 """Of a scene with all its things: one byte numbers them, those of the surroundings too."""
+_KEYS = ("like", "stage", "light", "exposure", "colors", "props", "objects", "hard")
+_SPANS = ((-2.25, 2.25), (-2.25, 2.25), (0.3, 1.85))
+"""Where in the room a light may be: x, y and z."""
 RESERVED = ("wooden table", "wall", "tiled floor", "sky", *NEGATIVES)
 """Classes of the surroundings, and the words that every question is compared with."""
 
@@ -46,6 +50,9 @@ class SceneFile:
     objects: tuple[Spot, ...]
     hard: tuple[Spot, ...]
     """What stands there too where it is to be hard."""
+    light: Light = LAMP
+    exposure: float = 0.0
+    """Photographs differ by up to so many stops to either side (`vlgs.data.synthetic.photographs.exposures`)."""
 
     @property
     def outdoors(self) -> bool:
@@ -89,7 +96,7 @@ def _library() -> tuple[Colors, Mapping[str, Thing]]:
 
 
 def _read_scene(node: Node, name: str) -> SceneFile:
-    entries = node.entries(("like", "stage", "colors", "props", "objects", "hard"))
+    entries = node.entries(_KEYS)
     base = SceneFile(name, name, "room", (), ())
     if "like" in entries:
         base = replace(_shipped(entries["like"].option(SCENES)), name=name, key=name)
@@ -100,7 +107,14 @@ def _read_scene(node: Node, name: str) -> SceneFile:
         props = {**props, **_props(entries["props"], colors)}
     objects, hard = (_spots(entries[k], props) if k in entries else () for k in ("objects", "hard"))
     stage = entries["stage"].option(("room", *STAGES)) if "stage" in entries else base.stage
-    read = replace(base, stage=stage, objects=base.objects + objects, hard=base.hard + hard)
+    read = replace(
+        base,
+        stage=stage,
+        objects=base.objects + objects,
+        hard=base.hard + hard,
+        light=_light(entries["light"]) if "light" in entries else base.light,
+        exposure=entries["exposure"].number(0, 2) if "exposure" in entries else base.exposure,
+    )
     if not read.objects:
         raise node.wrong("a scene with objects, or like another", list(entries))
     things = [spot.thing for spot in read.objects + read.hard]
@@ -111,6 +125,15 @@ def _read_scene(node: Node, name: str) -> SceneFile:
         if kinds[thing.name] != thing.kind:
             raise node.wrong("a scene whose things of one class are of one kind", thing.name)
     return read
+
+
+def _light(node: Node) -> Light:
+    entries = node.entries(("at", "radius", "power", "ambient"), ("at", "radius"))
+    items = entries["at"].items(3, 3)
+    x, y, z = (item.number(*span) for item, span in zip(items, _SPANS, strict=True))
+    shares = {key: entries[key].number(0, 1) for key in ("power", "ambient") if key in entries}
+    given = {"power": LAMP.power, "ambient": LAMP.ambient} | shares
+    return light_on_table((x, y, z), entries["radius"].number(0.01, 0.6), **given)
 
 
 def _spots(node: Node, props: Mapping[str, Thing]) -> tuple[Spot, ...]:

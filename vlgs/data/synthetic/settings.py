@@ -3,9 +3,10 @@
 import hashlib
 from dataclasses import astuple, dataclass, field
 
-from vlgs.data.synthetic import outdoors
+from vlgs.data.synthetic import lights, outdoors
 from vlgs.data.synthetic.layouts import DIFFICULTIES
 from vlgs.data.synthetic.masks import LabelNoise
+from vlgs.data.synthetic.room import LAMP
 from vlgs.data.synthetic.scene_file import SceneFile, find_scene
 
 VERSION = 1
@@ -56,4 +57,6 @@ class SceneSettings:
             text += f" shared {shared}"
         if self.scene.outdoors:
             text += f" outdoors {outdoors.VERSION}"
+        if self.scene.light != LAMP or self.scene.exposure:
+            text += f" lights {lights.VERSION}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

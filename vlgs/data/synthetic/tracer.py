@@ -1,9 +1,10 @@
 """An analytic ray tracer: rays in, colours and first surfaces out.
 
 It shares no code and no formula with the rasterizer. Light is Lambert's from one lamp plus an ambient part that is
-brighter from above; soft shadows lie on the table and on the floor only, because those of things on things are small and
-dear. Glass is a stack of thin panes, blended without refraction and denser at grazing angles; steel shows the room after
-one bounce. Colours are blended as displayed, in [0, 1], which is what a splatting model does too.
+brighter from above. Soft shadows lie on the table and on the floor; those of things on things are dear, and small under a lamp
+at the ceiling: they are cast where a scene has a light of its own. Glass is a stack of thin panes, blended without refraction and
+denser at grazing angles; steel shows the room after one bounce. Colours are blended as displayed, in [0, 1], which is what a
+splatting model does too.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from vlgs.data.synthetic.room import LAMP
 from vlgs.data.synthetic.shapes import Vectors
 from vlgs.data.synthetic.world import NOTHING, Hits, World, by_part
 
@@ -78,20 +78,20 @@ def _shade(
     normal *= -np.sign(facing)
     facing = np.abs(facing)
 
-    to_lamp = np.array(LAMP)[:, None] - point
+    to_lamp = np.array(world.light.center)[:, None] - point
     to_lamp /= np.sqrt((to_lamp**2).sum(0))
     lit = np.maximum((normal * to_lamp).sum(0), 0.0)
-    for number, shade in world.shades.items():
-        on = np.flatnonzero(hits.part == number)
-        lit[on] *= np.where(normal[2, on] > 0.9, shade.at(point[:, on]), 1.0)
-    ambient = 0.50 + 0.10 * normal[2]
-    color = albedo * (ambient + 0.55 * lit)
+    arrives = world.lamp_share(hits, point, normal, lit > 0)
+    lit *= arrives
+    ambient = world.light.ambient + 0.10 * normal[2]
+    color = albedo * (ambient + world.light.power * lit)
     cover = np.ones(hits.t.shape)
     for number, rays in by_part(hits.part):
         material = world.parts[number].material
         shine = 0.0
         if material.gloss:
             shine = material.gloss * _glare(normal[:, rays], to_lamp[:, rays] - direction[:, rays])
+            shine *= arrives[rays]
         if material.kind == "light":
             color[:, rays] = albedo[:, rays]
         elif material.kind == "glass":

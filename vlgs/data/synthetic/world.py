@@ -1,11 +1,13 @@
 """Intersection of rays with all things of a scene: the first hit, its colour and normal, and how much light of the lamp arrives there."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
+from vlgs.data.synthetic.lights import Light
 from vlgs.data.synthetic.objects import Part, Thing
 from vlgs.data.synthetic.room import FLOOR, LAMP, ROOM, TABLE_RADIUS
 from vlgs.data.synthetic.shapes import Vectors
@@ -15,9 +17,8 @@ NOTHING = 255
 
 _NEAR_BLOCK = 2048
 """Rays whose distances to all parts stay in the cache."""
-_SHADOW_RAYS = 24
 _SHADOW_CELLS = 192
-_LAMP_RADIUS = 0.26
+_LIFT = 1e-4  # a shadow ray starts this far above its surface, in metres
 _GLASS_PASSES = 0.7  # share of the light that one piece of glass lets through
 
 
@@ -52,8 +53,9 @@ class Shade:
 class World:
     """Things with everything precomputed that a ray needs to know about them."""
 
-    def __init__(self, things: tuple[Thing, ...]):
+    def __init__(self, things: tuple[Thing, ...], light: Light = LAMP):
         self.things = things
+        self.light = light
         self.parts: tuple[Part, ...] = tuple(part for thing in things for part in thing.parts)
         self.thing_of_part = np.repeat(np.arange(len(things)), [len(t.parts) for t in things])
         self._rotations = [np.array(part.rotation) for part in self.parts]
@@ -64,27 +66,109 @@ class World:
         self._bound_centers = np.concatenate(self._centers, axis=1).T + axes * heights[:, None]
         # Which rays come near is decided in float32 with a millimetre to spare.
         self._bound_radii2 = np.array([[(radius + 1e-3) ** 2] for _, radius in bounds], np.float32)
+        names = np.array([things[thing].name for thing in self.thing_of_part])
+        self._table, self._floor = (
+            np.flatnonzero(names == word).tolist() for word in ("wooden table", "tiled floor")
+        )
+        self._casters = range(self._table[-1] + 1)
 
     @functools.cached_property
     def shades(self) -> dict[int, Shade]:
-        """Shadows of what stands on the table on its top, and of the table on the floor, by part number; cast when the first ray asks."""
-        names = np.array([self.things[thing].name for thing in self.thing_of_part])
-        table, floor = (
-            np.flatnonzero(names == "wooden table"),
-            np.flatnonzero(names == "tiled floor"),
-        )
+        """Shadows on the table's top and on the floor, by part number; cast when the first ray asks.
+
+        What stands on the table shades its top, the table the floor; a light whose shadows fall on things is kept from both by both.
+        """
+        table, floor = self._table[0], self._floor[0]
         return {
-            int(table[0]): self._shade(TABLE_RADIUS, 0.0, list(range(table[0]))),
-            int(floor[0]): self._shade(ROOM, FLOOR, table.tolist()),
+            table: self._shade(TABLE_RADIUS, 0.0, range(table)),
+            floor: self._shade(ROOM, FLOOR, self._table),
         }
 
-    def _shade(self, half: float, height: float, casters: list[int]) -> Shade:
-        """Look from every grid point at a disc of lamp points; glass dims it, all else stops it."""
+    def lamp_share(
+        self,
+        hits: Hits,
+        point: Float[np.ndarray, "3 n"],
+        normal: Float[np.ndarray, "3 n"],
+        faces: Bool[np.ndarray, " n"],
+    ) -> Float[np.ndarray, " n"]:
+        """Share of the lamp that reaches each hit point.
+
+        The table's top and the floor look it up on a grid. Elsewhere it is 1, or with a light whose shadows fall on things, counted.
+
+        Args:
+            hits: What was hit.
+            point: Where, in metres.
+            normal: Of the surface, on the side that is seen.
+            faces: Which points look towards the lamp at all.
+        """
+        share = np.ones(hits.t.shape)
+        counted = faces & (hits.part != NOTHING)
+        for number, shade in self.shades.items():
+            on = np.flatnonzero((hits.part == number) & (normal[2] > 0.9))
+            share[on] = shade.at(point[:, on])
+            counted[on] = False
+        if self.light.on_things:
+            share[~faces] = 0.0
+            rays = np.flatnonzero(counted)
+            share[rays] = self.counted_share((point + _LIFT * normal).take(rays, axis=1))
+        return share
+
+    def counted_share(self, origin: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+        """Share of the lamp that reaches each of any points: rays to it are dimmed by glass and stopped by all else."""
+        goals = self.light.points().T
+        along, squared = apply(origin.T, goals), (origin * origin).sum(0)[:, None]
+        length2 = squared - 2 * along + (goals * goals).sum(0)
+        through = np.ones(along.shape)
+        blocked = self._between(origin)
+        for number in self._casters:
+            points = np.flatnonzero(blocked[number])
+            center = self._bound_centers[number][None]
+            # Squared distance of the sphere's centre from a ray, times the squared length of the ray.
+            off = apply(center, origin.take(points, axis=1)).T - squared[points]
+            ahead = apply(center, goals) - off - along[points]
+            apart2 = (center * center).sum() - 2 * off - squared[points]
+            near = (apart2 - self._bound_radii2[number]) * length2[points] <= ahead * ahead
+            row, goal = np.nonzero(near & (through[points] > 0))
+            row = points[row]
+            start = origin.take(row, axis=1)
+            direction = goals.take(goal, axis=1) - start
+            length = np.sqrt((direction * direction).sum(0))
+            t, _ = self._intersect(number, start, direction / length, np.zeros(row.size))
+            glass = self.parts[number].material.kind == "glass"
+            hit = t < length
+            through[row[hit], goal[hit]] *= _GLASS_PASSES if glass else 0.0
+        return through.mean(axis=1)
+
+    def _between(self, origin: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, "parts n"]:
+        """Which parts' bounding spheres reach into the cone from a point to the lamp."""
+        start = origin.astype(np.float32)
+        axis = np.array(self.light.center, np.float32)[:, None] - start
+        length = np.sqrt((axis * axis).sum(0))
+        axis /= length
+        near = np.empty((len(self._casters), origin.shape[1]), bool)
+        for number in self._casters:
+            radius = float(self._bound_radii2[number, 0]) ** 0.5
+            offset = self._bound_centers[number].astype(np.float32)[:, None] - start
+            along = (offset * axis).sum(0)
+            apart2 = (offset * offset).sum(0) - along * along
+            # A ray that meets the sphere does so at this share of its way at most: that far the cone has opened.
+            way = (along + radius) / np.maximum(length - self.light.radius, 1e-3)
+            reach = radius + self.light.radius * np.clip(way, 0.0, 1.0)
+            near[number] = (way > 0) & (apart2 <= reach * reach)
+        return near
+
+    def _shade(self, half: float, height: float, casters: Sequence[int]) -> Shade:
+        """Look from every grid point at the points of the lamp.
+
+        Only `casters` stand between them under the lamp at the ceiling.
+        """
         steps = np.linspace(-half, half, _SHADOW_CELLS)
         x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
-        origin = np.stack([x, y, np.full(x.shape, height + 1e-4)])
-        light = np.zeros(x.size)
-        for goal in _lamp_points():
+        origin = np.stack([x, y, np.full(x.shape, height + _LIFT)])
+        if self.light.on_things:
+            return Shade(half, self.counted_share(origin).reshape(_SHADOW_CELLS, _SHADOW_CELLS))
+        light, goals = np.zeros(x.size), self.light.points()
+        for goal in goals:
             direction = goal[:, None] - origin
             direction /= np.sqrt((direction**2).sum(0))
             through = np.ones(x.size)
@@ -96,7 +180,7 @@ class World:
                 glass = self.parts[number].material.kind == "glass"
                 through[rays[np.isfinite(t)]] *= _GLASS_PASSES if glass else 0.0
             light += through
-        return Shade(half, (light / _SHADOW_RAYS).reshape(_SHADOW_CELLS, _SHADOW_CELLS))
+        return Shade(half, (light / len(goals)).reshape(_SHADOW_CELLS, _SHADOW_CELLS))
 
     def _near(
         self, origin: Vectors, direction: Float[np.ndarray, "3 n"]
@@ -179,11 +263,3 @@ def by_part(part: UInt8[np.ndarray, " n"]) -> list[tuple[int, np.ndarray]]:
     numbers, starts = np.unique(part[order], return_index=True)
     groups = np.split(order, starts[1:])
     return [(int(n), rays) for n, rays in zip(numbers, groups, strict=True) if n != NOTHING]
-
-
-def _lamp_points() -> Float[np.ndarray, "s 3"]:
-    """A sunflower of points on the lamp's disc: even, and without a random draw."""
-    ray = np.arange(_SHADOW_RAYS)
-    radius, angle = _LAMP_RADIUS * np.sqrt((ray + 0.5) / _SHADOW_RAYS), 2.39996 * ray
-    offset = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(ray.size)], axis=1)
-    return np.array(LAMP) + offset
