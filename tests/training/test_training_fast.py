@@ -109,9 +109,26 @@ def test_rates_of_colour_and_shape_fall_along_half_a_cosine(tiny_scene: Scene):
     assert rates["means"] == pytest.approx(module.settings.means_rate(8) * module.densifying.extent)
 
 
+def test_rates_made_for_another_budget_grow_by_the_root(tiny_scene: Scene):
+    plain, paced = (
+        module_of(tiny_scene, *LESS, f"trainer.rates_for={made}") for made in ("null", 64)
+    )
+    for module in (plain, paced):
+        module.set_schedule(8)
+    rates, faster = (
+        {group["name"]: group["lr"] for group in module.optimizer.param_groups}
+        for module in (plain, paced)
+    )
+    for name in ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits"):
+        assert faster[name] == pytest.approx(2 * rates[name]), name  # sqrt(64 / 16)
+    for name in ("features", "indicator_logits"):
+        assert faster[name] == rates[name], name
+    assert TrainerConfig(16, LearningRates(means_final=0.0), rates_for=16).pace == 1
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("color_decay", 1.5), ("half_size", -0.1), ("half_size", 1.1)],
+    [("color_decay", 1.5), ("rates_for", 0), ("half_size", -0.1), ("half_size", 1.1)],
 )
 def test_what_cannot_be_is_refused_by_name(key: str, value: float):
     with pytest.raises(ValueError, match=f"trainer: {key} must be"):

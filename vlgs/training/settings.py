@@ -93,6 +93,9 @@ class TrainerConfig:
     """Share of their rates that codes and indicators have left in the end, after half a cosine over the run; 1: they stay."""
     color_decay: float = 1.0
     """The same for quats, log_scales, opacity_logits, sh0 and shN; positions have `LearningRates.means_final`."""
+    rates_for: int | None = None
+    """Iterations that the rates of positions, shapes, opacities and colours are made for: in a budget of others they are sqrt(rates_for / iterations)
+    times as large. None: they are as they stand."""
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
@@ -117,22 +120,32 @@ class TrainerConfig:
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
+        if self.rates_for is not None:
+            require_range("trainer", 1, MOST_ITERATIONS, rates_for=self.rates_for)
+
+    @property
+    def pace(self) -> float:
+        """Factor of the rates of colour and shape. As gradients of single views are noise for the most part, half as many steps go as far with
+        steps that are sqrt(2) times as large."""
+        return 1.0 if self.rates_for is None else math.sqrt(self.rates_for / self.iterations)
 
     def means_rate(self, step: int) -> float:
         """Learning rate of positions at a step, in units of the scene extent (3DGS's log-linear decay)."""
         share = min(step / (self.means_steps or self.iterations), 1.0)
         rates = self.learning_rates
         if rates.means == 0 or rates.means_final == 0:
-            return rates.means * (1 - share) + rates.means_final * share  # no logarithm leads to 0
-        return rates.means * (rates.means_final / rates.means) ** share
+            rate = rates.means * (1 - share) + rates.means_final * share  # no logarithm leads to 0
+        else:
+            rate = rates.means * (rates.means_final / rates.means) ** share
+        return self.pace * rate
 
     def decay(self, name: str, step: int) -> float:
-        """Share of its rate that a parameter of the Gaussians has at a step: half a cosine over the run."""
+        """Factor of its rate that a parameter of the Gaussians has at a step: half a cosine over the run."""
         end = (
             self.language_decay if name in _LANGUAGE else self.color_decay if name in _COLOR else 1
         )
         fallen = (1 - math.cos(math.pi * min(step / self.iterations, 1.0))) / 2
-        return 1 + (end - 1) * fallen
+        return (self.pace if name in _COLOR else 1) * (1 + (end - 1) * fallen)
 
     def is_half_size(self, step: int) -> bool:
         """Whether an iteration sees views at half their size."""
