@@ -126,7 +126,8 @@ class TrainerConfig:
     @property
     def pace(self) -> float:
         """Factor of the rates of colour and shape. As gradients of single views are noise for the most part, half as many steps go as far with
-        steps that are sqrt(2) times as large."""
+        steps that are sqrt(2) times as large.
+        """
         return 1.0 if self.rates_for is None else math.sqrt(self.rates_for / self.iterations)
 
     def means_rate(self, step: int) -> float:
