@@ -125,9 +125,7 @@ class TrainerConfig:
 
     @property
     def pace(self) -> float:
-        """Factor of the rates of colour and shape. As gradients of single views are noise for the most part, half as many steps go as far with
-        steps that are sqrt(2) times as large.
-        """
+        """Factor of the rates of colour and shape: what a run of steps of random sign covers grows with the root of their number."""
         return 1.0 if self.rates_for is None else math.sqrt(self.rates_for / self.iterations)
 
     def means_rate(self, step: int) -> float:
