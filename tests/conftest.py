@@ -129,6 +129,15 @@ def types_are_checked_in_parts(request: pytest.FixtureRequest) -> Iterator[None]
     jaxtyping.config.update("jaxtyping_disable", before)
 
 
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Likewise for a test that trains or traces the same several times, what its neighbours do once with checks."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
+
+
 @pytest.fixture(scope="session")
 def tiny_scene() -> "Scene":
     from vlgs.data.synthetic import load_scene

@@ -47,6 +47,7 @@ def scene() -> Scene:
     "name", ["glassware", "mirrors", "lookalikes", "patchwork", "wirework", "rows", "smallware"]
 )
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
+@pytest.mark.usefixtures("unchecked")
 def test_every_scene_loads(name, difficulty):
     scene = load_scene(name, difficulty, **SMALL)
     assert scene.name == name  # tables look runs up by data.scene
