@@ -43,7 +43,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def files_of_options_parsed_once() -> Iterator[None]:
-    """Hydra composes some thousand configurations of the same hundred files; what it is given of each is made anew."""
+    """Hydra composes hundreds of configurations of the same files; what it is given of each is made anew."""
     from omegaconf import DictConfig, OmegaConf
 
     load, kept = OmegaConf.load, dict[str, Any]()
