@@ -1,12 +1,13 @@
 """What several areas need: a small procedural scene, read once, and the folder of real data."""
 
 import functools
+import gc
 import importlib
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import jaxtyping
 import pytest
@@ -23,6 +24,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Import what most tests need, in each process that runs tests; pytest's own, which hands them out, needs none of it."""
     if config.getoption("dist", "no") != "no" and "PYTEST_XDIST_WORKER" not in os.environ:
         return
+    # A third of the time until the first test would go into looking for garbage among modules, which are none.
+    gc.disable()
     # While a module of vlgs is imported, jaxtyping looks for compiled files under names of its own, also for all that this module
     # imports: without this, 3 500 modules of other packages would be compiled anew in every worker.
     for name in ("torch", "torchmetrics", "lightning.pytorch.loggers", "kornia", "matplotlib.pyplot", "pandas", "viser"):  # fmt: skip
@@ -30,6 +33,48 @@ def pytest_configure(config: pytest.Config) -> None:
             importlib.import_module(name)
         except ImportError:  # an extra that is not installed
             continue
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is looked for among what tests make, not among all that was imported for them."""
+    gc.freeze()
+    gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def files_of_options_parsed_once() -> Iterator[None]:
+    """Hydra composes hundreds of configurations of the same files; what it is given of each is made anew."""
+    from omegaconf import DictConfig, OmegaConf
+
+    load, kept = OmegaConf.load, dict[str, Any]()
+
+    def load_once(file: str | Path | IO[str]) -> Any:
+        if isinstance(file, str | Path):
+            return load(file)
+        text = file.read()
+        if text in kept:
+            return OmegaConf.create(kept[text])
+        file.seek(0)
+        made = load(file)
+        if isinstance(made, DictConfig):
+            kept[text] = OmegaConf.to_container(made)
+        return made
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", staticmethod(load_once))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rows_of_tables_composed_once() -> Iterator[None]:
+    """The tests ask for a few dozen rows hundreds of times, and Hydra takes a tenth of a second for each."""
+    from vlgs.tables import benchmark
+
+    compose = benchmark._compose
+    known = functools.cache(lambda overrides: compose(list(overrides)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(benchmark, "_compose", lambda overrides: known(tuple(overrides)))
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -80,6 +125,15 @@ def types_are_checked_in_parts(request: pytest.FixtureRequest) -> Iterator[None]
     """Checks of types and shapes take two fifths of a training run: where whole runs are tested they are off, tests of their parts have them."""
     before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in WHOLE_RUNS)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Likewise for a test that trains or traces the same several times, what its neighbours do once with checks."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", before)
 

@@ -25,7 +25,8 @@ from vlgs.tables.registry import Table, load_table
 
 
 @pytest.fixture(autouse=True)
-def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    monkeypatch.setenv("VLGS_FAKES", str(tmp_path_factory.getbasetemp()))
     monkeypatch.setattr(job, "RUN", (sys.executable, ablate_fakes.__file__))
     monkeypatch.setattr(job, "POLL_SECONDS", 0.05)
     monkeypatch.setattr(runner, "WAIT_SECONDS", 0.1)

@@ -32,7 +32,8 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    monkeypatch.setenv("VLGS_FAKES", str(tmp_path_factory.getbasetemp()))
     monkeypatch.setattr(warm, "MODULE", "ablate_fakes")
     monkeypatch.setattr(warm, "SHARED", ("ablate_fakes",))
     monkeypatch.setattr(job, "RUN", (sys.executable, "-c", "raise SystemExit(9)"))  # none runs cold

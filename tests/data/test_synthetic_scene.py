@@ -57,6 +57,7 @@ def scene() -> Scene:
     ],
 )
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
+@pytest.mark.usefixtures("unchecked")
 def test_every_scene_loads(name, difficulty):
     scene = load_scene(name, difficulty, **SMALL)
     assert scene.name == name  # tables look runs up by data.scene

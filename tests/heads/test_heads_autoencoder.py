@@ -75,7 +75,7 @@ def camvid(request: pytest.FixtureRequest) -> tuple[Autoencoder, Tensor]:
         classes = normalize(torch.from_numpy(np.load(CITYSCAPES)[CAMVID].astype(np.float32)))
     else:
         pytest.skip("real text embeddings not at hand")
-    head = Autoencoder()
+    head = Autoencoder(training=AutoencoderTraining(steps=300))  # half of what a run takes
     vectors, areas, _ = masks(classes, 60, seed=2)
     head.fit(vectors, areas)
     return head, classes

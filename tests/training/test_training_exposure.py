@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
+import pytest
 import torch
 from tiny_runs import TINY, composed
 from torch import Tensor
@@ -51,6 +52,7 @@ def test_maps_are_the_identity_on_average():
     torch.testing.assert_close(mean, color)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_dark_photographs_have_dark_maps(tmp_path: Path):
     module = trained(tmp_path, "trainer.iterations=150")
     assert module.step.exposure is not None

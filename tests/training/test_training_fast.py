@@ -81,6 +81,7 @@ def test_views_are_small_in_the_first_half(tiny_scene: Scene, tmp_path: Path):
 
 
 @pytest.mark.parametrize("stop", [5, 8, 11])
+@pytest.mark.usefixtures("unchecked")
 def test_stopped_before_at_and_after_the_change_it_goes_on_to_the_same_bits(
     tiny_scene: Scene, tmp_path: Path, stop: int
 ):

@@ -49,6 +49,7 @@ def test_an_iteration_moves_it_and_what_is_not_finite_in_it_is_named(tiny_scene:
         module.training_step(2, 0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_resumed_run_has_the_same_bits(tiny_scene: Scene, tmp_path: Path):
     densify = ("gaussians.densify={start: 2, stop: 10, every: 4, reset_every: 6}", "gaussians.densify.grad_threshold=1e-6")  # fmt: skip
     whole = train(module_of(tiny_scene, *densify), tmp_path / "whole")
@@ -66,6 +67,7 @@ def test_a_resumed_run_has_the_same_bits(tiny_scene: Scene, tmp_path: Path):
     assert_same_bits(train(module_of(tiny_scene, *densify), tmp_path / "parts"), whole)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_it_learns_the_embeddings_of_the_masks(tiny_scene: Scene, tmp_path: Path):
     module = module_of(tiny_scene, "trainer.iterations=60", "loss.language.error=l1")
 

@@ -205,6 +205,7 @@ def test_a_level_is_rendered_and_asked_as_if_it_were_alone(scenes: list[Scene]):
 
 
 @pytest.mark.parametrize("overrides", [(), ("indicator=per_level", "fusion=none")])
+@pytest.mark.usefixtures("unchecked")
 def test_resume_is_bit_identical(scenes: list[Scene], tmp_path: Path, overrides: tuple[str, ...]):
     joint, options = join_levels(scenes), (*overrides, *DENSIFY)
     whole = train(module_of(joint, *options), tmp_path / "whole")
@@ -226,6 +227,7 @@ def test_resume_is_bit_identical(scenes: list[Scene], tmp_path: Path, overrides:
     assert not [key for key in one if not torch.equal(one[key], two[key])]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_training_learns_every_level(scenes: list[Scene], tmp_path: Path):
     module = module_of(join_levels(scenes), "trainer.iterations=120", "indicator=per_level")
 

@@ -78,6 +78,7 @@ def made(progress: Progress) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("model", [1, 2])
+@pytest.mark.usefixtures("unchecked")
 def test_stopped_in_either_stage_it_goes_on_to_the_same_bits(
     tiny_scene: Scene, tmp_path: Path, model: int
 ):

@@ -102,6 +102,7 @@ def test_every_level_is_asked_by_itself(indicator: str):
 
 
 @pytest.mark.parametrize("share", [0.7, 1.0])
+@pytest.mark.usefixtures("unchecked")
 def test_the_end_of_training_is_when_it_happens(tmp_path: Path, share: float):
     module = module_of(None, f"gaussians.silent_above={share}", "trainer.iterations=30")
     fit(module, RunFolder(tmp_path), FitOptions(meta={}, progress=False))

@@ -28,6 +28,7 @@ from vlgs.training.workshop import Workshop
 from vlgs.types import Scene, View
 
 KEPT = tuple(o for o in TINY if not o.startswith("head."))
+QUICK = "head.training.steps=30"
 SHAPE = ("means", "quats", "log_scales")
 
 
@@ -61,12 +62,12 @@ def module_of(method: str, scene: Scene, *overrides: str) -> VLGSModule:
 
 
 def test_3dgs_learns_from_colour_alone(tiny_scene: Scene, tmp_path: Path):
-    progress, _ = made("gs3d", tiny_scene, tmp_path, "trainer.iterations=4")
+    progress, _ = made("gs3d", tiny_scene, tmp_path, "trainer.iterations=4", QUICK)
     field = progress.field()
     assert isinstance(field, SplatField)
     assert not field.has_language
     assert not field.model.splats["features"].any()
-    module = module_of("gs3d", tiny_scene)
+    module = module_of("gs3d", tiny_scene, QUICK)
     done = module.step.forward(0)
     pairs = zip(done.seen.renders, done.seen.targets, strict=True)
     by_hand = sum(l1_dssim(render.color, target.image) for render, target in pairs)  # type: ignore[arg-type]
@@ -74,9 +75,7 @@ def test_3dgs_learns_from_colour_alone(tiny_scene: Scene, tmp_path: Path):
 
 
 def test_langsplat_moves_codes_alone(tiny_scene: Scene, tmp_path: Path):
-    progress, workshop = made(
-        "langsplat", tiny_scene, tmp_path, "trainer.iterations=6", "head.training.steps=30"
-    )
+    progress, workshop = made("langsplat", tiny_scene, tmp_path, "trainer.iterations=6", QUICK)
     geometry, learned = progress.gaussians("geometry", 3), progress.gaussians("", 3)
     for name, value in learned.splats.items():
         assert torch.equal(value, geometry.splats[name]) == (name != "features"), name
@@ -93,7 +92,7 @@ def test_langsplat_moves_codes_alone(tiny_scene: Scene, tmp_path: Path):
 
 
 def test_langsplats_loss_counts_every_pixel(gaps: Scene):
-    module = module_of("langsplat", gaps, "head.training.steps=30")
+    module = module_of("langsplat", gaps, QUICK)
     module.model.splats["features"].data.normal_()
     done = module.step.forward(0)
     for place, render, target in zip("12", done.seen.renders, done.seen.targets, strict=True):
@@ -112,7 +111,7 @@ def test_langsplats_loss_counts_every_pixel(gaps: Scene):
 
 
 def test_langsplat_of_equal_budget_halves_both_schedules(tiny_scene: Scene, tmp_path: Path):
-    made("langsplat_equal", tiny_scene, tmp_path, "trainer.iterations=12", "head.training.steps=30")
+    made("langsplat_equal", tiny_scene, tmp_path, "trainer.iterations=12", QUICK)
     for name in ("geometry", ""):
         checkpoint = load_checkpoint(RunFolder(tmp_path / name).checkpoint)
         assert checkpoint is not None

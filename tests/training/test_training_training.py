@@ -74,6 +74,7 @@ def stop_at(module: VLGSModule, step: int) -> None:
 
 # 5: between densifications, statistics half gathered; 8: right after one; 13: after the reset; 17: after a degree joined.
 @pytest.mark.parametrize("stop", [5, 8, 13, 17])
+@pytest.mark.usefixtures("unchecked")
 def test_resume_is_bit_identical_to_never_having_stopped(
     tiny_scene: Scene, tmp_path: Path, stop: int
 ):
@@ -90,6 +91,7 @@ def test_resume_is_bit_identical_to_never_having_stopped(
     assert_same_bits(whole, second)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
     tiny_scene: Scene, tmp_path: Path
 ):
@@ -105,6 +107,7 @@ def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
     assert_same_bits(modules[0], modules[2])
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_training_lowers_the_loss(tiny_scene: Scene, tmp_path: Path):
     module = module_of(tiny_scene, "trainer.iterations=80")
     losses = []
