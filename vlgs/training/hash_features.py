@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import huber_loss, interpolate, normalize
+from torch.nn.functional import interpolate, normalize
 
 from vlgs.demands import Demand
 from vlgs.fields import Field
@@ -19,6 +19,7 @@ from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.geometry import resize_camera
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.huber import huber_sum
 from vlgs.ops.neighbours import neighbour_products
 from vlgs.training.fit_learner import train_learner
 from vlgs.training.language_field import HUBER
@@ -229,8 +230,7 @@ def embedding_loss(
     image: Float[Tensor, "h w e"], vectors: Float[Tensor, "h w e"], valid: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
     """Huber's loss with delta 1.25, summed over the numbers of an embedding; the mean over pixels with a mask, and 0 without any."""
-    loss = huber_loss(image[valid], vectors[valid], delta=HUBER, reduction="sum")
-    return loss / valid.sum().clamp_min(1)
+    return huber_sum(image, vectors, valid, HUBER) / valid.sum().clamp_min(1)
 
 
 def second_loss(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
