@@ -13,10 +13,12 @@ struct Huber {
   const T *target;    // [height, width, channels]
   const bool *valid;  // [height, width]
   T delta;
-  T *clamped;  // [height, width, channels]: image - target within plus and minus delta, 0 at pixels that do not count
+  T *clamped;  // [height, width, channels]: image - target within plus and minus delta, 0 at pixels that do
+               // not count
 };
 
-// Sum of x (d - x / 2) with d the difference and x the clamped one. Bits do not depend on the number of threads.
+// Sum of x (d - x / 2) with d the difference and x the clamped one. Bits do not depend on the number of
+// threads.
 template <class T>
 double huber(const Huber<T> &, int threads);
 

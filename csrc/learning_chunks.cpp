@@ -30,7 +30,8 @@ double huber_row(const Huber<T> &h, int64_t y) {
       std::fill_n(clamped, h.channels, T(0));
       continue;
     }
-    const T *__restrict image = h.image + y * h.row + x * h.pixel, *__restrict target = h.target + at * h.channels;
+    const T *__restrict image = h.image + y * h.row + x * h.pixel, *__restrict target =
+                                                                       h.target + at * h.channels;
     constexpr int kSums = 8;
     T sums[kSums] = {};
     int64_t c = 0;
@@ -53,12 +54,14 @@ double huber_row(const Huber<T> &h, int64_t y) {
 
 template <class T>
 void radam_moments(const RAdamMoments<T> &r, int threads) {
-  for_chunks(r.count, threads, [&](int64_t begin, int64_t end) { kernels<T>().radam_moments_of(r, begin, end); });
+  for_chunks(r.count, threads,
+             [&](int64_t begin, int64_t end) { kernels<T>().radam_moments_of(r, begin, end); });
 }
 
 template <class T>
 void radam_weights(const RAdamWeights<T> &r, int threads) {
-  for_chunks(r.count, threads, [&](int64_t begin, int64_t end) { kernels<T>().radam_weights_of(r, begin, end); });
+  for_chunks(r.count, threads,
+             [&](int64_t begin, int64_t end) { kernels<T>().radam_weights_of(r, begin, end); });
 }
 
 template <class T>
@@ -83,7 +86,8 @@ void neighbours_backward(const Neighbours<T> &n, int threads) {
 template <class T>
 double huber(const Huber<T> &h, int threads) {
   const Buffer<double> sums(h.height);
-  for_each(h.height, worth(h.height * h.width * h.channels, threads), [&](int64_t y) { sums[y] = huber_row(h, y); });
+  for_each(h.height, worth(h.height * h.width * h.channels, threads),
+           [&](int64_t y) { sums[y] = huber_row(h, y); });
   double total = 0;
   for (int64_t y = 0; y < h.height; ++y) total += sums[y];
   return total;

@@ -15,7 +15,8 @@ struct MappedError {
   T scale;
 };
 
-// Sum of |made + bias - wanted|. The bits of both depend neither on the number of threads nor on the instruction set.
+// Sum of |made + bias - wanted|. The bits of both depend neither on the number of threads nor on the
+// instruction set.
 template <class T>
 double mapped_error(const MappedError<T> &, int threads);
 

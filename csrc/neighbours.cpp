@@ -45,7 +45,8 @@ void neighbours_backward_row(const Neighbours<T> &n, int64_t y) {
         beside.add(n.image + ((y - dy + 1) * n.width + x - dx + 1) * n.channels,
                    d_products[(y - dy) * columns + x - dx]);
       if (is_inner)
-        inner.add(n.image + ((y + dy - 1) * n.width + x + dx - 1) * n.channels, d_products[(y - 1) * columns + x - 1]);
+        inner.add(n.image + ((y + dy - 1) * n.width + x + dx - 1) * n.channels,
+                  d_products[(y - 1) * columns + x - 1]);
     }
     T *const to = n.d_image + (y * n.width + x) * n.channels;
     int64_t i = 0;

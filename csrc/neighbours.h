@@ -13,7 +13,8 @@ struct Neighbours {
   T *d_image;           // [height, width, channels]
 };
 
-// Terms are added in the order of PyTorch's: as a neighbour of others, last neighbour first, then as an inner pixel.
+// Terms are added in the order of PyTorch's: as a neighbour of others, last neighbour first, then as an inner
+// pixel.
 template <class T>
 void neighbours_backward(const Neighbours<T> &, int threads);
 

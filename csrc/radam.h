@@ -10,10 +10,10 @@ namespace vlgs {
 template <class T>
 struct RAdamMoments {
   int64_t count;
-  const T *weight, *gradient;    // [count]
-  T *mean, *square;              // [count] moving averages of the gradient and of its square
-  T decay;                       // of weights, added to the gradient
-  T to_mean, kept, to_square;    // shares: of the gradient in the mean, of the old and of the new square
+  const T *weight, *gradient;  // [count]
+  T *mean, *square;            // [count] moving averages of the gradient and of its square
+  T decay;                     // of weights, added to the gradient
+  T to_mean, kept, to_square;  // shares: of the gradient in the mean, of the old and of the new square
 };
 template <class T>
 struct RAdamWeights {

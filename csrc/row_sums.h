@@ -1,4 +1,5 @@
-// The gradient of a table whose weighted rows were summed: every row gets the gradients of the sums that it is in.
+// The gradient of a table whose weighted rows were summed: every row gets the gradients of the sums that it
+// is in.
 #pragma once
 
 #include <cstdint>
@@ -17,8 +18,8 @@ struct RowSums {
   T *d_table;             // [count, features]
 };
 
-// Adds in the order of points and corners whatever the threads, as each grid has rows of its own. Returns how many
-// rows are those of another grid: these are left out.
+// Adds in the order of points and corners whatever the threads, as each grid has rows of its own. Returns how
+// many rows are those of another grid: these are left out.
 template <class T>
 int64_t row_sums_backward(const RowSums<T> &, int threads);
 

@@ -42,8 +42,10 @@ class _NeighbourProducts(torch.autograd.Function):
         out = image.new_empty(len(_SHIFTS), max(0, h - 2), max(0, w - 2))
         for top, end in _bands(image, out.shape[1]):
             inner = image[top + 1 : end + 1, 1 : w - 1]
-            for made, (y, x) in zip(out, _SHIFTS, strict=True):
-                made[top:end] = (inner * image[top + y : end + y, x : x + w - 2]).sum(-1)
+            products = image.new_empty(len(_SHIFTS), *inner.shape)
+            for product, (y, x) in zip(products, _SHIFTS, strict=True):
+                torch.mul(inner, image[top + y : end + y, x : x + w - 2], out=product)
+            out[:, top:end] = products.sum(-1)
         ctx.save_for_backward(image)
         return out
 
