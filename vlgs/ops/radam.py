@@ -52,12 +52,12 @@ def _on_cpu(weight: Tensor, gradient: Tensor, moments: Moments, rates: Rates) ->
     if adaptive:
         ratio = (length - 4) * (length - 2) * endless / ((endless - 4) * (endless - 2) * length)
         rectified = ratio**0.5
-    shares = rates.decay, 1 - rates.beta1, rates.beta2, 1 - rates.beta2
-    factors = 1 - kept1, rates.rate, rates.eps, (1 - kept2) ** 0.5, rectified
+    shares = (rates.decay, 1 - rates.beta1, rates.beta2, 1 - rates.beta2)
+    factors = (1 - kept1, rates.rate, rates.eps, (1 - kept2) ** 0.5, rectified)
     threads = torch.get_num_threads()
-    for part in zip(*(t.split(_PART) for t in (weight, gradient, *moments)), strict=True):
-        own, _, mean, square = part
-        _csrc.radam_moments(*arrays(*part), *shares, threads)
+    parts = (t.split(_PART) for t in (weight, gradient, moments.mean, moments.square))
+    for own, d_own, mean, square in zip(*parts, strict=True):
+        _csrc.radam_moments(*arrays(own, d_own, mean, square), *shares, threads)
         root = square.sqrt() if adaptive else None  # PyTorch's are not rounded as the machine's
         _csrc.radam_weights(*arrays(mean, root, own), *factors, threads)
 
