@@ -37,4 +37,5 @@ NB_MODULE(_csrc, m) {
   bind_squared_error(m);
   bind_cached_weights(m);
   bind_code_table(m);
+  bind_learning(m);
 }

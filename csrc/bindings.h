@@ -34,5 +34,6 @@ void bind_ssim(nb::module_ &m);
 void bind_squared_error(nb::module_ &m);
 void bind_cached_weights(nb::module_ &m);
 void bind_code_table(nb::module_ &m);
+void bind_learning(nb::module_ &m);
 
 }  // namespace vlgs

@@ -11,6 +11,9 @@
 
 #include "attention.h"
 #include "code_table.h"
+#include "mapped_error.h"
+#include "neighbours.h"
+#include "radam.h"
 #include "squared_error.h"
 #include "ssim.h"
 
@@ -185,6 +188,8 @@ constexpr int kSlotHead = 8;  // where wide channels begin
 // ssim_*: rows [begin, end), all channels; with scratch as large as the *_scratch of its direction says.
 // squared_error_*: pixels [begin, end), few enough for sums in T.
 // code_table_pixels: pixels [begin, end); how many of them lack a node.
+// mapped_error_pixels: pixels [begin, end). neighbours_backward_row: one row of an image.
+// radam_*: numbers [begin, end).
 // clang-format off
 #define VLGS_KERNELS(KERNEL)                                                                                     \
   KERNEL(void, project, const Camera &, Gaussians<T>, Splats<T>, int64_t begin, int64_t end)                     \
@@ -215,7 +220,11 @@ constexpr int kSlotHead = 8;  // where wide channels begin
   KERNEL(void, ssim_backward_rows, const Ssim<T> &, const SsimGrads<T> &, int64_t begin, int64_t end, T *scratch) \
   KERNEL(ErrorSum, squared_error_chunk, const SquaredError<T> &, int64_t begin, int64_t end)                     \
   KERNEL(void, squared_error_chunk_backward, const SquaredError<T> &, T scale, T *d_a, int64_t begin, int64_t end)\
-  KERNEL(int64_t, code_table_pixels, const CodeTable<T> &, int64_t begin, int64_t end)
+  KERNEL(int64_t, code_table_pixels, const CodeTable<T> &, int64_t begin, int64_t end)                           \
+  KERNEL(void, radam_moments_of, const RAdamMoments<T> &, int64_t begin, int64_t end)                            \
+  KERNEL(double, mapped_error_pixels, const MappedError<T> &, int64_t begin, int64_t end)                        \
+  KERNEL(void, neighbours_backward_row, const Neighbours<T> &, int64_t y)                                        \
+  KERNEL(void, radam_weights_of, const RAdamWeights<T> &, int64_t begin, int64_t end)
 // clang-format on
 
 template <class T>

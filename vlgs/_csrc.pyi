@@ -203,6 +203,42 @@ def code_table(
 ) -> int:
     """How many codes lack a node."""
 
+def radam_moments(
+    weight: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    decay: float,
+    to_mean: float,
+    kept: float,
+    to_square: float,
+    threads: int,
+) -> None: ...
+def radam_weights(
+    mean: Tensor,
+    root: Tensor | None,
+    weight: Tensor,
+    bias: float,
+    rate: float,
+    eps: float,
+    scale: float,
+    rectified: float,
+    threads: int,
+) -> None: ...
+def mapped_error(
+    made: Tensor, bias: Tensor, wanted: Tensor, which: Tensor, scale: float, threads: int
+) -> float: ...
+def huber(
+    image: Tensor, target: Tensor, valid: Tensor, delta: float, clamped: Tensor, threads: int
+) -> float: ...
+def neighbours_backward(
+    image: Tensor, d_products: Tensor, d_image: Tensor, threads: int
+) -> None: ...
+def row_sums_backward(
+    weights: Tensor, rows: Tensor, begins: Tensor, d_sums: Tensor, d_table: Tensor, threads: int
+) -> int:
+    """How many rows are those of another grid."""
+
 class CachedWeightsFloat:
     def __init__(self, picture: RasterizedFloat, threads: int) -> None: ...
     def keep(self, picture: RasterizedFloat, threads: int) -> None: ...

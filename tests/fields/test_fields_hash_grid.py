@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from vlgs.fields.hash_grid import GridConfig, HashGrid, contract, interpolate
+from vlgs.ops.row_sums import row_sums_backward
 
 SMALL = GridConfig(levels=3, features=2, coarsest=2, finest=9, log2_table=6)
 """The first grid has a row for each of its 27 corners, the others share 64."""
@@ -52,6 +53,42 @@ def test_the_gradient_is_that_of_finite_differences():
     rows, weights = grid.corners(torch.rand(5, 3, dtype=torch.float64))
     table = torch.rand(len(grid.table), 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda t: interpolate(t, rows, weights), (table,))
+
+
+@pytest.mark.parametrize("features", [2, 3, 8])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_gradient_is_added_in_the_order_of_the_points(features: int, threads: int):
+    """PyTorch's `bincount` does so too, a feature at a time."""
+    config = GridConfig(levels=3, features=features, coarsest=2, finest=9, log2_table=6)
+    grid = HashGrid(config, torch.Generator().manual_seed(0))
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
+    upstream = torch.randn(300, 3 * features, generator=torch.Generator().manual_seed(2))
+    rows, weights = grid.corners(points)
+    by_grid = upstream.view(300, 3, features).transpose(0, 1).reshape(-1, features)
+    want = [
+        torch.bincount(rows.flatten(), (channel[:, None] * weights).flatten(), len(grid.table))
+        for channel in by_grid.unbind(1)
+    ]
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        (got,) = torch.autograd.grad(grid(points), grid.table, upstream)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(got, torch.stack(want, dim=1))
+
+
+def test_rows_of_other_grids_are_refused():
+    begins, weights, d_sums = torch.tensor([0, 4]), torch.ones(2, 8), torch.ones(1, 2, 3)
+    rows = torch.tensor([[0, 1, 2, 3] * 2, [4, 5, 6, 7] * 2]).int()
+    assert row_sums_backward(begins, rows, weights, d_sums, 8).tolist() == [[2.0] * 3] * 8
+    for place, row in ((0, 4), (1, 3), (0, -1), (1, 8)):
+        odd = rows.clone()
+        odd[place, 5] = row
+        with pytest.raises(ValueError, match="rows must be those of their grids, got 1 of others"):
+            row_sums_backward(begins, odd, weights, d_sums, 8)
+    with pytest.raises(ValueError, match=r"rows and weights must be \[4, 8\]"):
+        row_sums_backward(begins, rows, weights, torch.ones(2, 2, 3), 8)
 
 
 def test_released_sizes():

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import get_args
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
@@ -17,7 +18,12 @@ from vlgs.losses import l1_dssim, masked_mse, ssim_map
 from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.code_table import LANES, code_table
 from vlgs.ops.depth import camera_depth, render_depth
+from vlgs.ops.huber import huber_sum
 from vlgs.ops.machine import peak_fma
+from vlgs.ops.mapped_error import mapped_error_
+from vlgs.ops.neighbours import neighbour_products
+from vlgs.ops.radam import Moments, Rates, radam_step
+from vlgs.ops.row_sums import row_sums_backward
 from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, DepthKind, RasterConfig
 
@@ -47,6 +53,7 @@ def run_layers(seed: int, poison: tuple[float, ...]) -> None:
         _differentiate(run.__name__.strip("_"), *run(rng), rng, bad)
     _squared_error(rng, poison)
     _code_table(np.random.default_rng([seed, 2]), poison)
+    _learning(np.random.default_rng([seed, 3]), poison)
     packs = int(rng.integers(0, 1000))
     _require(peak_fma(packs) >= packs, "peak_fma did less than it was asked for")
 
@@ -213,6 +220,53 @@ def _code_table(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
     _require(lacking == least or bool(odd.any()), "code_table: no other code is lacking")
     most = rows.abs().amax() * (1 + 1e2 * torch.finfo(dtype).eps)
     _require(bool((answers[~unknown].abs() <= most).all()), "code_table: answers must be means")
+
+
+def _learning(rng: np.random.Generator, poison: tuple[float, ...]) -> None:
+    """What trains networks, with anything in it: gradients where no pixel counts, rows that are none, weights of any number."""
+    dtype, width = _dtype(rng), int(rng.choice([1, 3, 15, 16, 17, 40]))
+    height, columns = (int(rng.choice(SIDES)) for _ in "hw")
+    image = _normal(rng, dtype, height, columns, width + 3)
+    if rng.random() < 0.5:
+        picked = image.view(-1)
+        picked[int(rng.integers(len(picked)))] = _cast(rng.choice(poison), dtype)
+    valid = torch.from_numpy(rng.random((height, columns)) < rng.choice([0.0, 0.5, 1.0]))
+    leaf = image.requires_grad_()
+    part = leaf[..., 3:]
+    loss = huber_sum(part, torch.zeros_like(part), valid, 1.25)
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    _require(not gradient[~valid].any(), "huber: pixels that do not count must have no gradient")
+    torch.autograd.grad(neighbour_products(leaf).sum(), leaf)
+
+    n = int(rng.choice([*ROWS[1:], *LONG]))
+    made, table = _normal(rng, dtype, n, width), _normal(rng, dtype, 3, width)
+    signs = made - table[torch.arange(n) % 3]
+    mapped_error_(made, torch.zeros(width, dtype=dtype), table, torch.arange(n) % 3, 1.0)
+    _require(torch.equal(made, signs.sign()), "mapped_error: the gradient must be the sign")
+
+    grids, points = int(rng.integers(1, 4)), int(rng.choice(ROWS))
+    rows = torch.from_numpy(rng.integers(0, 5, (grids, points * 8))).int()
+    rows += 5 * torch.arange(grids).int()[:, None]
+    rows, weights = rows.view(-1, 8), torch.ones(grids * points, 8, dtype=dtype)
+    d_sums = torch.ones(points, grids, int(rng.choice([1, 2, 8])), dtype=dtype)
+    d_table = row_sums_backward(5 * torch.arange(grids), rows, weights, d_sums, 5 * grids)
+    _require(float(d_table.sum()) == 8 * d_sums.numel(), "row_sums: every corner must count once")
+    if len(rows):
+        rows[int(rng.integers(len(rows))), 3] = int(
+            rng.choice([-1, 5 * grids, 2**31 - 1, -(2**31)])
+        )
+        with pytest.raises(ValueError, match="rows must be those of their grids"):
+            row_sums_backward(5 * torch.arange(grids), rows, weights, d_sums, 5 * grids)
+
+    tensors = [_normal(rng, dtype, n) for _ in range(3)]
+    moments = Moments(tensors[1], tensors[2].abs())
+    radam_step(
+        tensors[0],
+        tensors[1].clone(),
+        moments,
+        Rates(1e-2, 0.9, 0.999, 1e-15, 0.0, float(rng.integers(1, 20))),
+    )
+    _require(bool(tensors[0].isfinite().all()), "radam: must stay finite")
 
 
 def _agree(name: str, got: Tensor, want: Tensor, in_range: Tensor, relative: float) -> None:

@@ -13,7 +13,12 @@ from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.losses import l1_dssim, masked_mse, ssim_map
 from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.code_table import code_table
+from vlgs.ops.huber import huber_sum
+from vlgs.ops.mapped_error import mapped_error_
+from vlgs.ops.neighbours import neighbour_products
+from vlgs.ops.radam import Moments, Rates, radam_step
 from vlgs.ops.rasterize import rasterize
+from vlgs.ops.row_sums import row_sums_backward
 from vlgs.ops.ssim import KERNELS
 from vlgs.ops.view_color import view_color
 from vlgs.types import Camera, ChannelGroup, RasterConfig
@@ -36,6 +41,15 @@ CALLS: dict[str, Callable[[], object]] = {
         there(5, 2), there(5, 2)
     ),
     "squared_error": lambda: masked_mse(there(4, 5, 3), there(4, 5, 3)),
+    "huber": lambda: huber_sum(there(4, 5, 3), there(4, 5, 3), there(4, 5).bool(), 1.0),
+    "mapped_error": lambda: mapped_error_(there(4, 3), there(3), there(2, 3), there(4).long(), 1.0),
+    "neighbours": lambda: neighbour_products(there(4, 5, 3)),
+    "radam": lambda: radam_step(
+        there(5), there(5), Moments(there(5), there(5)), Rates(1e-3, 0.9, 0.999, 1e-8, 0.0, 1.0)
+    ),
+    "row_sums": lambda: row_sums_backward(
+        there(1).long(), there(4, 8).int(), there(4, 8), there(4, 1, 2), 8
+    ),
     "ssim": lambda: ssim_map(there(4, 5, 3), there(4, 5, 3)),
     "l1_dssim": lambda: l1_dssim(there(4, 5, 3), there(4, 5, 3)),
     "code_table": lambda: code_table(there(4, 3), 1.0, there(2, 2, 2).int(), there(8, 8), 5),

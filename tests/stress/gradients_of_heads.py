@@ -131,7 +131,7 @@ HEAD_CHECKS: dict[str, Callable[[], Check]] = {
         [draw(3, 2), draw(4, 2, seed=1), draw(4, seed=2)],
     ),
     "vlgs.objectives.mapped_error.mapped_l1": lambda: (
-        lambda codes, weight, bias: mapped_l1(codes, weight, bias, (9 + draw(3, 4, seed=3)).__getitem__, 3.0),
+        lambda codes, weight, bias: mapped_l1(codes, weight, bias, 9 + draw(3, 4, seed=3), torch.arange(3), 3.0),
         [draw(3, 2), draw(4, 2, seed=1), draw(4, seed=2)],
     ),
     "vlgs.objectives.code_classes.CodeClasses.terms": lambda: (

@@ -84,6 +84,7 @@ NO_GRADIENT = {
     )},
     "vlgs.ops.rasterize_to_pixels.weights_alone": "the constants of a CachedView",
     "vlgs.ops.depth.median_rows": "picks rows",
+    "vlgs.ops.row_sums.row_sums_backward": "a gradient itself",
     "vlgs.ops.arrays.arrays": "hands over, computes nothing",
     **{f"vlgs.fields.comparing.{name}": "training is over" for name in (
         "Comparing.__call__", "Decoding.__call__", "Folding.__call__", "Folding.flat", "Tabulating.__call__",

@@ -49,6 +49,7 @@ from vlgs.ops.absolute_error import absolute_error
 from vlgs.ops.attention import Token, attend
 from vlgs.ops.cached_weights import CachedView
 from vlgs.ops.depth import at_rows, camera_depth, render_depth
+from vlgs.ops.huber import huber_sum
 from vlgs.ops.neighbours import neighbour_products
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
@@ -253,6 +254,9 @@ CHECKS: dict[str, Callable[[], Check]] = {
     ),
     "vlgs.ops.absolute_error.absolute_error": lambda: (
         absolute_error, [draw(*SIZE), 2 + draw(*SIZE, seed=1)]
+    ),
+    "vlgs.ops.huber.huber_sum": lambda: (
+        lambda image: huber_sum(image, torch.zeros_like(image), VALID, 0.4), [draw(*SIZE)]
     ),
     "vlgs.ops.neighbours.neighbour_products": lambda: (neighbour_products, [draw(4, 5, 2)]),
     "vlgs.ops.squared_error.squared_error": lambda: both(squared_error, VALID, "all"),

@@ -137,7 +137,7 @@ def test_the_target_is_the_mean_over_mask_levels(
     made: tuple[Progress, Workshop], tiny_scene: Scene
 ):
     other = replace(tiny_scene, mask_vectors=tiny_scene.mask_vectors.flip(0))
-    learner = HashLearner(join_levels([tiny_scene, other]), made[0].gaussians("geometry", 3), STAGE, SETTINGS, 0)  # fmt: skip
+    learner = HashLearner(join_levels([tiny_scene, other]), made[0].gaussians("geometry", 3), replace(STAGE, shrink=1), SETTINGS, 0)  # fmt: skip
     vectors, valid = learner._vectors(0, torch.Size((36, 48)))
     read = tiny_scene.train[0].read_masks
     assert read is not None

@@ -5,10 +5,12 @@ from itertools import product
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
+from vlgs.ops.row_sums import row_sums_backward
 from vlgs.values import require_fields, require_range
 
 _PRIMES = (1, 2654435761, 805459861)
@@ -83,7 +85,8 @@ class HashGrid(nn.Module):
         self.table = nn.Parameter(_START * (2 * start - 1))
         rows = torch.tensor(config.rows)
         self._resolutions = torch.tensor(config.resolutions)
-        self._offsets = (rows.cumsum(0) - rows).int()[:, None]
+        self._begins = rows.cumsum(0) - rows
+        self._offsets = self._begins.int()[:, None]
         # Grids only grow, so that those with a row for each corner come first.
         self._dense = sum(
             (cells + 1) ** 3 <= 1 << config.log2_table for cells in config.resolutions
@@ -98,10 +101,7 @@ class HashGrid(nn.Module):
         """Features of points in the unit cube; those beside it count as on its side. No gradient reaches the points."""
         with torch.no_grad():
             rows, weights = self.corners(points)
-        features = interpolate(self.table, rows, weights).view(
-            -1, len(points), self.config.features
-        )
-        return features.transpose(0, 1).flatten(1)
+        return interpolate(self.table, rows, weights, self._begins)
 
     def corners(
         self, points: Float[Tensor, "n 3"]
@@ -140,33 +140,42 @@ class HashGrid(nn.Module):
 
 
 def interpolate(
-    table: Float[Tensor, "r f"], rows: Int32[Tensor, "m 8"], weights: Float[Tensor, "m 8"]
-) -> Float[Tensor, "m f"]:
+    table: Float[Tensor, "r f"],
+    rows: Int32[Tensor, "nl 8"],
+    weights: Float[Tensor, "nl 8"],
+    begins: Int64[Tensor, " l"] | None = None,
+) -> Float[Tensor, "n w"]:
     """Sums of eight weighted rows of a table, differentiable by the table alone.
 
-    PyTorch's own gradient of `embedding_bag` sorts its rows and takes twenty times as long as the sums of this one, which are
+    PyTorch's own gradient of `embedding_bag` sorts its rows and takes far longer than the sums of this one, which are
     added in the order of the points and therefore have the same bits for any number of threads.
+
+    Args:
+        table: The features of l grids.
+        rows: Which ones, grid by grid.
+        weights: What they count.
+        begins: First row of each grid; None: there is one.
     """
-    return _Interpolate.apply(table, rows, weights)
+    return _Interpolate.apply(
+        table, rows, weights, rows.new_zeros(1).long() if begins is None else begins
+    )
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(rows, weights)
-        ctx.rows = len(table)
-        return embedding_bag(rows, table, mode="sum", per_sample_weights=weights)
+    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor, begins: Tensor) -> Tensor:
+        ctx.save_for_backward(rows, weights, begins)
+        ctx.shape = table.shape
+        sums = embedding_bag(rows, table, mode="sum", per_sample_weights=weights)
+        return sums.view(len(begins), -1, table.shape[1]).transpose(0, 1).flatten(1)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        (gradient,) = gradients
-        rows, weights = ctx.saved_tensors
-        flat = rows.flatten()
-        sums = [
-            torch.bincount(flat, (channel[:, None] * weights).flatten(), minlength=ctx.rows)
-            for channel in gradient.unbind(1)
-        ]
-        return torch.stack(sums, dim=1), None, None
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        rows, weights, begins = ctx.saved_tensors
+        count, features = ctx.shape
+        d_sums = gradients[0].view(-1, len(begins), features)
+        return row_sums_backward(begins, rows, weights, d_sums, count), None, None, None
 
 
 def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:

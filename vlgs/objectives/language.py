@@ -11,7 +11,7 @@ from vlgs.heads.linear import Linear
 from vlgs.losses import masked_cosine, masked_l1, masked_mse
 from vlgs.objectives.mapped_error import mapped_l1
 from vlgs.objectives.objective import Objective, Setup, StepView
-from vlgs.objectives.targets import Target, TrainingViews
+from vlgs.objectives.targets import Target, TrainingViews, masked_codes
 from vlgs.ops.squared_error import Pixels
 from vlgs.values import require_choice
 
@@ -78,15 +78,11 @@ class Language(Objective):
         count = int(valid.sum())
         if count == 0:
             return feature.sum() * 0
-        codes, masks = feature.view(*valid.shape, -1)[valid], target.masks[valid]  # [p, d], [p]
+        codes, masks = masked_codes(feature, target)
         share = count / valid.numel() if self.pixels == "all" else 1.0
         if self.error == "l1" and isinstance(self.head, Linear):
-            views, map_ = self.views, self.head.map
-
-            def wanted(some: slice) -> Tensor:
-                return views.codes_of(masks[some])
-
-            error = mapped_l1(codes, map_.weight, map_.bias, wanted, share)
+            map_ = self.head.map
+            error = mapped_l1(codes, map_.weight, map_.bias, self.views.codes, masks, share)
         else:
             error = _ERRORS[self.error](self.predict(codes[None]), self.views.codes_of(masks)[None])
         return error * share if self.pixels == "all" else error

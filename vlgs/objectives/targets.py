@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -61,6 +61,9 @@ class TrainingViews:
         codes: Target of every mask, [m, t]; m = 0 without language.
         sampler: Which views an iteration sees.
         counts: Where similarities that are known already are counted.
+
+    Attributes:
+        codes: Targets by mask, and the one of no mask.
     """
 
     def __init__(
@@ -72,12 +75,12 @@ class TrainingViews:
         self.counts = counts
         self.similarities: dict[tuple[int, int], float] = {}
         # "No mask" is -1, which indexes the last row, a zero code.
-        self._codes = torch.cat([codes, torch.zeros(1, codes.shape[1])])
+        self.codes = torch.cat([codes, torch.zeros(1, codes.shape[1])])
         self.cache = PixelCache(self._room())
 
     def at_half_size(self) -> "TrainingViews":
         """The same views, in the same pairs, with half their width and height."""
-        return TrainingViews(half_size(self.scene), self._codes[:-1], self.sampler, self.counts)
+        return TrainingViews(half_size(self.scene), self.codes[:-1], self.sampler, self.counts)
 
     def __getitem__(self, index: int) -> Target:
         """A training view by its place in the scene."""
@@ -88,7 +91,7 @@ class TrainingViews:
 
     def codes_of(self, masks: Int[Tensor, "*b"]) -> Float[Tensor, "*b t"]:
         """Targets of masks, by their rows; -1 gives zeros."""
-        return self._codes[masks.long()]
+        return self.codes[masks.long()]
 
     def _map(self, index: int, name: LanguageMap) -> Tensor:
         read = self.scene.train[index].read_masks
@@ -113,7 +116,7 @@ class TrainingViews:
 
     def _room(self) -> int:
         """Bytes for cached targets: all views if they fit, else the two views of one iteration. Caching some of the views would rarely help."""
-        code = 4 * self._codes.shape[1] + 1  # and whether it counts
+        code = 4 * self.codes.shape[1] + 1  # and whether it counts
         pixel = 3 * 4 + (code * self.scene.mask_levels if self.has_language else 0)
         views = [pixel * view.camera.width * view.camera.height for view in self.scene.train]
         return sum(views) if sum(views) <= TARGET_BYTES else 2 * max(views)
@@ -123,8 +126,24 @@ def masked_codes(
     feature: Float[Tensor, "h w c"], target: Target
 ) -> tuple[Float[Tensor, "p d"], Int[Tensor, " p"]]:
     """The rendered codes of the pixels that have a mask, and the rows of their masks; mask levels of a pixel count one by one."""
-    valid = target.valid
-    return feature.view(*valid.shape, -1)[valid], target.masks[valid].long()
+    rows = target.valid.flatten().nonzero()[:, 0]
+    codes = _Rows.apply(feature.view(target.valid.numel(), -1), rows)
+    return cast(Tensor, codes), target.masks.flatten()[rows].long()
+
+
+class _Rows(torch.autograd.Function):
+    """Rows of which none comes twice: PyTorch adds their gradients up, on one thread or atomically."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.shape = values.shape
+        return values.index_select(0, rows)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        (rows,) = ctx.saved_tensors
+        return grad_outputs[0].new_zeros(ctx.shape).index_copy_(0, rows, grad_outputs[0]), None
 
 
 def covered(view: View) -> Bool[Tensor, "h w"] | None:

@@ -8,6 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from vlgs import _csrc
+from vlgs.ops.arrays import arrays
+from vlgs.ops.device import Kernels
+
 _SHIFTS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
 """Places of the eight neighbours in the 3x3 pixels around an inner one."""
 _NUMBERS = 1 << 18
@@ -25,7 +29,7 @@ def neighbour_products(image: Float[Tensor, "h w c"]) -> Float[Tensor, "8 ih iw"
         >>> neighbour_products(image)[:, 0, 0]
         tensor([ 0.,  0., 11.,  0.,  0.,  0.,  0.,  0.])
     """
-    return cast(Tensor, _NeighbourProducts.apply(image))
+    return KERNELS.of(image)(image)
 
 
 class _NeighbourProducts(torch.autograd.Function):
@@ -33,12 +37,15 @@ class _NeighbourProducts(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor) -> Tensor:
+        image = image.contiguous()
         h, w, _ = image.shape
         out = image.new_empty(len(_SHIFTS), max(0, h - 2), max(0, w - 2))
         for top, end in _bands(image, out.shape[1]):
             inner = image[top + 1 : end + 1, 1 : w - 1]
-            for made, (y, x) in zip(out, _SHIFTS, strict=True):
-                made[top:end] = (inner * image[top + y : end + y, x : x + w - 2]).sum(-1)
+            products = image.new_empty(len(_SHIFTS), *inner.shape)
+            for product, (y, x) in zip(products, _SHIFTS, strict=True):
+                torch.mul(inner, image[top + y : end + y, x : x + w - 2], out=product)
+            out[:, top:end] = products.sum(-1)
         ctx.save_for_backward(image)
         return out
 
@@ -46,20 +53,9 @@ class _NeighbourProducts(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         (image,) = ctx.saved_tensors
-        d_out = grad_outputs[0][..., None]
-        rows, w = d_out.shape[1], image.shape[1]
-        d_image = torch.zeros_like(image)
-        places = [*enumerate(_SHIFTS)][::-1]
-        for first, last in _bands(image, len(image)):
-            for k, (y, x) in places:  # as a neighbour of inner pixels
-                top, end = max(0, first - y), max(0, min(rows, last - y))
-                product = image[top + 1 : end + 1, 1 : w - 1] * d_out[k, top:end]
-                d_image[top + y : end + y, x : x + w - 2] += product
-            top, end = max(0, first - 1), max(0, min(rows, last - 1))
-            d_inner = torch.zeros_like(image[top + 1 : end + 1, 1 : w - 1])
-            for k, (y, x) in places:
-                d_inner += image[top + y : end + y, x : x + w - 2] * d_out[k, top:end]
-            d_image[top + 1 : end + 1, 1 : w - 1] += d_inner
+        d_image = torch.empty_like(image)
+        given = arrays(image, grad_outputs[0].contiguous(), d_image)
+        _csrc.neighbours_backward(*given, torch.get_num_threads())
         return d_image
 
 
@@ -68,3 +64,10 @@ def _bands(image: Tensor, rows: int) -> Iterator[tuple[int, int]]:
     step = max(1, _NUMBERS // max(1, image[:1].numel()))
     for top in range(0, rows, step):
         yield top, min(top + step, rows)
+
+
+def _on_cpu(image: Tensor) -> Tensor:
+    return cast(Tensor, _NeighbourProducts.apply(image))
+
+
+KERNELS = Kernels("neighbours", cpu=_on_cpu)

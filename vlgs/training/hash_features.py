@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import huber_loss, interpolate, normalize
+from torch.nn.functional import interpolate, normalize
 
 from vlgs.demands import Demand
 from vlgs.fields import Field
@@ -19,6 +19,7 @@ from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.geometry import resize_camera
 from vlgs.ops.cached_weights import CachedView
+from vlgs.ops.huber import huber_sum
 from vlgs.ops.neighbours import neighbour_products
 from vlgs.training.fit_learner import train_learner
 from vlgs.training.language_field import HUBER
@@ -28,7 +29,7 @@ from vlgs.training.second_map import PhotographMap, SecondMap
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.stages import Progress
 from vlgs.training.workshop import Workshop
-from vlgs.types import Scene
+from vlgs.types import Camera, Scene
 from vlgs.values import require_fields, require_range
 
 _WARM, _COOL = 20, 0.2
@@ -107,6 +108,8 @@ class _View:
     """Of the Gaussians that it sees."""
     rows: Tensor
     """Which ones."""
+    camera: Camera
+    """At that size."""
 
 
 class HashLearner(Learner):
@@ -145,8 +148,15 @@ class HashLearner(Learner):
         self.seen = [index for index, view in enumerate(scene.train) if view.read_masks is not None]
         self._views = CachedViews(settings.skip.kept_bytes)
         self._rows: dict[int, Tensor] = {}
-        self._means: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        self._sets: dict[int, tuple[Tensor, Tensor]] = {}
         self._seconds: dict[int, Tensor] = {}
+        # Now, and not when a view is first drawn: while training keeps the memory that it frees, what stays of each view would lie
+        # between holes of what was needed to make it, and a hundred views would take a gigabyte more.
+        for index in self.seen:
+            camera = self._view(index).camera
+            size = torch.Size((camera.height, camera.width))
+            self._sets_of(index, size)
+            self._second(index, size)
 
     def terms(self, draw: int, generator: torch.Generator) -> Mapping[str, Tensor]:
         """The two maps of one view, and how they agree on which neighbours are alike."""
@@ -184,28 +194,31 @@ class HashLearner(Learner):
             part |= {"camera": camera, "config": splats.raster}
             # Where there is no room for them, the weights of a view are made each time.
             view = self._views.make(index, **part) or CachedView(**part)
-        return _View(view, rows)
+        return _View(view, rows, camera)
 
     def _vectors(self, index: int, size: torch.Size) -> tuple[Tensor, Tensor]:
         """Mean vector of the masks of each pixel over the mask levels, and where there is one."""
-        if index not in self._means:
+        sets, which = self._sets_of(index, size)
+        valid = sets >= 0
+        vectors = (self.scene.mask_vectors[sets] * valid[..., None]).sum(1)
+        means = vectors / valid.sum(1, keepdim=True).clamp_min(1)
+        return means[which], valid.any(1)[which]
+
+    def _sets_of(self, index: int, size: torch.Size) -> tuple[Tensor, Tensor]:
+        """Which masks come together, one of each level, and which of these sets a pixel has: a view has some hundred."""
+        if index not in self._sets:
             read = self.scene.train[index].read_masks
             assert read is not None  # `self.seen`
             rows = read()
             rows = _nearest(rows[..., None] if rows.dim() == 2 else rows, size).long()
-            # Pixels of the same masks have one mean: a view has some hundred.
             which = torch.zeros(size, dtype=torch.long)
             for level in rows.unbind(2):
                 number = which * (len(self.scene.mask_vectors) + 1) + level + 1
                 which = number.unique(return_inverse=True)[1]
             sets = rows.new_empty(int(which.max()) + 1, rows.shape[2])
             sets[which] = rows
-            valid = sets >= 0
-            vectors = (self.scene.mask_vectors[sets] * valid[..., None]).sum(1)
-            means = vectors / valid.sum(1, keepdim=True).clamp_min(1)
-            self._means[index] = means, which, (rows >= 0).any(2)
-        means, which, valid = self._means[index]
-        return means[which], valid
+            self._sets[index] = sets, which  # not the means: of many views they are gigabytes
+        return self._sets[index]
 
     def _second(self, index: int, size: torch.Size) -> Float[Tensor, "h w c"]:
         if index not in self._seconds:
@@ -229,8 +242,7 @@ def embedding_loss(
     image: Float[Tensor, "h w e"], vectors: Float[Tensor, "h w e"], valid: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
     """Huber's loss with delta 1.25, summed over the numbers of an embedding; the mean over pixels with a mask, and 0 without any."""
-    loss = huber_loss(image[valid], vectors[valid], delta=HUBER, reduction="sum")
-    return loss / valid.sum().clamp_min(1)
+    return huber_sum(image, vectors, valid, HUBER) / valid.sum().clamp_min(1)
 
 
 def second_loss(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:

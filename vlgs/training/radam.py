@@ -1,14 +1,11 @@
-"""RAdam for large tables, a part at a time (Liu et al., ICLR 2020)."""
+"""RAdam for large tables (Liu et al., ICLR 2020)."""
 
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.optim.radam import radam
 
-_PART = 1 << 18
-"""Numbers of a part, a megabyte: large enough for threads, small enough to stay in cache with its gradients and moments."""
+from vlgs.ops.radam import Moments, Rates, radam_step
 
 
 class RAdam(torch.optim.RAdam):
@@ -33,22 +30,15 @@ class RAdam(torch.optim.RAdam):
                     state["step"] = torch.tensor(0.0)
                     state["exp_avg"] = torch.zeros_like(parameter)
                     state["exp_avg_sq"] = torch.zeros_like(parameter)
-                parts = _parts(parameter)
-                radam(
-                    parts,
-                    _parts(parameter.grad.contiguous()),
-                    _parts(state["exp_avg"]),
-                    _parts(state["exp_avg_sq"]),
-                    [state["step"].clone() for _ in parts],  # each part counts its own
-                    foreach=False,
-                    beta1=beta1,
-                    beta2=beta2,
-                    lr=group["lr"],
-                    weight_decay=group["weight_decay"],
-                    eps=group["eps"],
-                )
                 state["step"] += 1
-
-
-def _parts(tensor: Tensor) -> list[Tensor]:
-    return [*tensor.view(-1).split(_PART)]
+                rates = Rates(
+                    group["lr"],
+                    beta1,
+                    beta2,
+                    group["eps"],
+                    group["weight_decay"],
+                    state["step"].item(),
+                )
+                moments = Moments(state["exp_avg"].view(-1), state["exp_avg_sq"].view(-1))
+                gradient = parameter.grad.contiguous().view(-1)
+                radam_step(parameter.detach().view(-1), gradient, moments, rates)
