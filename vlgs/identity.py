@@ -66,6 +66,7 @@ GIVEN_FOLDERS = frozenset({"query.masks", "stages.second.folder"})
 """Keys, without the numbers of lists, that name a folder of files to learn from: likewise."""
 
 AS_WITHOUT: Mapping[str, Any] = {
+    "codec.training.axes": None,
     "data.faults.shared": 0,
     "gaussians.background": 0,
     "gaussians.codes": "none",
