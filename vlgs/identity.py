@@ -66,13 +66,13 @@ GIVEN_FOLDERS = frozenset({"query.masks", "stages.second.folder"})
 """Keys, without the numbers of lists, that name a folder of files to learn from: likewise."""
 
 AS_WITHOUT: Mapping[str, Any] = {
-    "codec.training.axes": None,
     "data.faults.shared": 0,
     "gaussians.background": 0,
     "gaussians.codes": "none",
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
+    "head.training.axes": None,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "query.masks": None,
     "stages": None,
@@ -151,7 +151,8 @@ def _counted(node: Any, key: str = "") -> dict[str, Any]:
     leaves = {former(k): v for k, v in _leaves(node, key)}
     if not key:
         leaves["loss"] = "default"  # as the group counted while one class held all terms
-    return {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
+    without = {former(k): v for k, v in AS_WITHOUT.items()}
+    return {k: v for k, v in leaves.items() if k not in without or without[k] != v}
 
 
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:

@@ -142,6 +142,12 @@ def test_a_fit_in_principal_axes_leaves_what_lies_across_them_out():
     assert head.reconstruction == pytest.approx(cosines.mean().item(), abs=1e-6)
 
 
+def test_batches_are_larger_where_there_is_more_to_tell_apart():
+    assert AutoencoderTraining().drawn(1024) == 128
+    assert AutoencoderTraining().drawn(1025) == 256
+    assert AutoencoderTraining(batch=7).drawn(5000) == 7
+
+
 def test_axes_that_are_all_there_are_change_nothing():
     vectors, areas, _ = masks(cone(5), 10, seed=2)
     fits = []

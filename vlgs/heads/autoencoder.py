@@ -38,7 +38,8 @@ class AutoencoderTraining:
     """How the autoencoder is trained: Adam on a one-cycle schedule."""
 
     steps: int = 400
-    batch: int = 128
+    batch: int | None = None
+    """Embeddings drawn for a step; None: 128, or 256 where there are more than 1024. With a hundred things in a scene 128 learn much less."""
     learning_rate: float = 4e-3
     """At the top of the cycle."""
     axes: int | None = 64
@@ -57,7 +58,8 @@ class AutoencoderTraining:
 
     def __post_init__(self) -> None:
         require_range("autoencoder", 2, 10**7, steps=self.steps)
-        require_range("autoencoder", 2, 2**20, batch=self.batch)
+        if self.batch is not None:
+            require_range("autoencoder", 2, 2**20, batch=self.batch)
         require_range("autoencoder", 0, 10, area_power=self.area_power, code_noise=self.code_noise)
         require_range("autoencoder", 0, 2**63 - 1, seed=self.seed)
         if self.axes is not None:
@@ -70,6 +72,12 @@ class AutoencoderTraining:
             raise ValueError(
                 f"autoencoder: min_coverage must be in (0, 1], got {self.min_coverage}"
             )
+
+    def drawn(self, rows: int) -> int:
+        """Size of a batch from so many embeddings that differ."""
+        if self.batch is not None:
+            return self.batch
+        return 128 if rows <= 1024 else 256
 
 
 DEFAULT_TRAINING = AutoencoderTraining()
@@ -237,10 +245,10 @@ class Autoencoder(nn.Module):
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
         )
-        draws = settings.steps * settings.batch
-        rows = torch.multinomial(weights, draws, True, generator=generator)
+        drawn = settings.drawn(len(vectors))
+        rows = torch.multinomial(weights, settings.steps * drawn, True, generator=generator)
         best: tuple[float, dict[str, Tensor]] = (-torch.inf, {})
-        for step, batch in enumerate(rows.split(settings.batch), start=1):
+        for step, batch in enumerate(rows.split(drawn), start=1):
             optimizer.zero_grad()
             self._loss(vectors[batch], step / settings.steps, generator).backward()
             optimizer.step()
