@@ -14,8 +14,9 @@ from vlgs.known import option
 from vlgs.opened.files import write_field
 from vlgs.prepare import Prepared
 from vlgs.query import Learning, TextEncoder
+from vlgs.report.answer import KeptAnswers
 from vlgs.report.evaluate import evaluate, prompts_of
-from vlgs.report.pictures import write_pictures
+from vlgs.report.pictures import drawn, write_pictures
 from vlgs.report.provenance import commit, machine
 from vlgs.report.results import write_metrics, write_queries
 from vlgs.report.timing import measure_fps
@@ -57,7 +58,8 @@ def report(
     words, _ = prompts_of(scene, query, text)
     if isinstance(query, Learning) and words is not None:
         field = query.learn(field, scene, words)
-    evaluation = evaluate(field, scene, query, text, experiment.protocol)
+    kept = KeptAnswers(drawn(scene) if experiment.pictures else ())
+    evaluation = evaluate(field, scene, query, text, experiment.protocol, kept)
     asked = questions_of(field, scene, query, text)
     prompts = asked.prompts if asked else None
     if asked and asked.note:
@@ -70,7 +72,7 @@ def report(
     cameras = [view.camera for view in scene.test or scene.train]
     timing = measure_fps(field, cameras, query, prompts, language)
     if experiment.pictures:
-        write_pictures(folder.renders, field, scene, query, prompts)
+        write_pictures(folder.renders, field, scene, query, prompts, kept=kept)
     extra = {
         "n_gaussians": sum(made.gaussians for made in workshop.kept),
         "levels": [level for level in ready.scenes if level is not None] if language else [],

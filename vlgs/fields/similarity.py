@@ -12,8 +12,8 @@ from vlgs.types import Camera
 SMALLEST_NORM = 1e-6
 """Vectors shorter than this count as having no direction: their cosines fade to 0 instead of being 0/0."""
 
-CHUNK = 4096
-"""Pixels that are decoded at once: 8 MB of 512-d float32 features, which stay in cache, whatever the size of the view."""
+CHUNK = 1024
+"""Pixels that are decoded at once: 2 MB of 512-d float32 features, which stay in cache, whatever the size of the view."""
 
 
 def rendered_feature(

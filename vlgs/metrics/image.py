@@ -6,10 +6,13 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import pad
 
 NAME = "image"
 VERSION = 1
+
+_BLOCK = 64
+"""Pixels that a product with the window makes at once. Few enough for sums of a product to be one chain, as those of a convolution are."""
 
 
 def psnr(
@@ -75,16 +78,26 @@ def _ssim_zero_padded(a: Float[Tensor, "1 c h w"], b: Float[Tensor, "1 c h w"]) 
     at = torch.arange(-5, 6, dtype=a.dtype)
     window = torch.exp(-at.square() / (2 * 1.5**2))
     window /= window.sum()
-    stacked = torch.cat([a, b, a * a, b * b, a * b]).flatten(0, 1)[:, None]
-    mean = conv2d(
-        conv2d(stacked, window[None, None, None], padding=(0, 5)),
-        window[None, None, :, None],
-        padding=(5, 0),
-    )
-    ma, mb, aa, bb, ab = mean[:, 0].chunk(5)
+    stacked = torch.cat([a, b, a * a, b * b, a * b]).flatten(0, 1)
+    mean = _windowed(_windowed(stacked, window).mT, window).mT.contiguous()
+    ma, mb, aa, bb, ab = mean.chunk(5)
     c1, c2 = 0.01**2, 0.03**2
     similar = (2 * ma * mb + c1) * (2 * (ab - ma * mb) + c2)
     return (similar / ((ma**2 + mb**2 + c1) * (aa - ma**2 + bb - mb**2 + c2)))[None]
+
+
+def _windowed(maps: Float[Tensor, "b h w"], window: Float[Tensor, " odd"]) -> Tensor:
+    """Each row under a window, zero beyond its ends, as products with a band of window values: a quarter of a convolution's time."""
+    width, reach = maps.shape[-1], len(window) - 1
+    band = maps.new_zeros(_BLOCK + reach, _BLOCK)
+    for column in range(_BLOCK):
+        band[column : column + len(window), column] = window
+    starts = range(
+        0, width, _BLOCK
+    )  # the last block is filled up: narrow products add in another order
+    padded = pad(maps, (reach // 2, reach // 2 + len(starts) * _BLOCK - width))
+    parts = [padded[..., at : at + _BLOCK + reach] @ band for at in starts]
+    return torch.cat(parts, dim=-1)[..., :width]
 
 
 NO_LPIPS = "LPIPS needs a pretrained AlexNet or VGG from torchvision (also in torchmetrics, lpips and piq), which is not a dependency"

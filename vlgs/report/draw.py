@@ -13,7 +13,7 @@ from vlgs.metrics.masks import Unit
 from vlgs.metrics.segment import blend, segment, smooth
 from vlgs.query import Prompts, Query
 from vlgs.report import colors
-from vlgs.report.answer import Answer, answer_view
+from vlgs.report.answer import Answer, KeptAnswers
 from vlgs.report.features import FeatureColors, fit_feature_colors, paint_features
 from vlgs.report.indicator import indicator_difference
 from vlgs.report.labels import read_truth, read_units
@@ -62,6 +62,7 @@ class Painter:
         query: How relevancy is computed.
         prompts: The scene's classes, encoded, or words for a scene without any; without either there is nothing to answer.
         views: The views whose features set the colours, usually those that will be drawn.
+        kept: Answers that scores were made from; None: all are made here.
     """
 
     @torch.no_grad()
@@ -72,7 +73,9 @@ class Painter:
         query: Query,
         prompts: Prompts | None,
         views: Sequence[View],
+        kept: KeptAnswers | None = None,
     ) -> None:
+        self.kept = KeptAnswers() if kept is None else kept
         self.field, self.scene, self.query, self.prompts = field.levels()[-1], scene, query, prompts
         self.gaussians = self.field if isinstance(self.field, HasGaussians) else None
         self.has_language = len(scene.mask_vectors) > 0
@@ -83,7 +86,7 @@ class Painter:
     @torch.no_grad()
     def draw(self, view: View, max_prompts: int) -> ViewPictures:
         """All pictures of one view; prompts that other views have shown less often come first."""
-        answer = answer_view(self.field, view.camera, self.prompts)
+        answer = self.kept.answer(self.field, view.camera, self.prompts)
         pictures = ViewPictures(
             name=view.name,
             photograph=view.read_image(),
@@ -152,7 +155,7 @@ class Painter:
         assert self.prompts is not None
         rows, bounds = range(len(self.prompts.names)), []
         for view in views:
-            answer = answer_view(self.field, view.camera, self.prompts)
+            answer = self.kept.answer(self.field, view.camera, self.prompts)
             bounds.append(torch.stack(self._blended(answer, rows).flatten(1).aminmax(dim=1)))
         low, high = torch.stack(bounds).unbind(dim=1)  # [views, k] each
         return torch.stack([low.amin(dim=0), high.amax(dim=0)])

@@ -12,7 +12,7 @@ from vlgs.metrics.masks import QueryScore
 from vlgs.metrics.mean import mean_of_known
 from vlgs.metrics.protocol import Auto, EvaluationProtocol, tag
 from vlgs.query import Prompts, Query, TextEncoder, encode_prompts
-from vlgs.report.answer import Answer, answer_view
+from vlgs.report.answer import Answer, KeptAnswers
 from vlgs.report.indicator import Histogram
 from vlgs.report.language import DENSE, LERF_OVS, LanguageScores, LanguageTally
 from vlgs.report.splats import SplatAnswers
@@ -58,6 +58,7 @@ def evaluate(
     query: Query,
     text: TextEncoder | None,
     protocol: EvaluationProtocol | Auto,
+    kept: KeptAnswers | None = None,
 ) -> Evaluation:
     """Render every held-out view once and score colour and language.
 
@@ -71,6 +72,7 @@ def evaluate(
         query: Relevancy of a prompt.
         text: Encodes `Scene.classes`. Without it, or if it lacks a word, there are no language scores, and the reason is given.
         protocol: Which scores are the headline; the dense ones and those of LERF-OVS stand beside them.
+        kept: Keeps answers for pictures; None: nothing is kept.
 
     Raises:
         ValueError: If labels name what `Scene.classes` does not have or differ in size from the view.
@@ -80,6 +82,7 @@ def evaluate(
     if not field.has_language:
         prompts, reason = None, NO_LANGUAGE
     gaussians, per_view = gaussians_of(field), {}
+    kept = KeptAnswers() if kept is None else kept
     tally = splats = None
     histogram = Histogram(scene.classes, scene.class_kinds)
     if prompts is not None:
@@ -87,7 +90,7 @@ def evaluate(
         if gaussians is not None:
             splats = SplatAnswers(gaussians, query, prompts)
     for view in scene.test:
-        answer = answer_view(field, view.camera, prompts)
+        answer = kept.answer(field, view.camera, prompts)
         per_view[view.name] = _image_scores(view, answer)
         if gaussians is not None:
             histogram.add(view, gaussians[0])

@@ -149,16 +149,19 @@ class _Sheet:
         foot = FOOT if has_foot else 0
         self.height = 2 * MARGIN + sum(heights) + GAP * len(rows) + foot
         self.figure = Figure(figsize=(self.width, self.height))
+        # One for all pictures: each axes takes long to make.
+        sheet = self._axes(0.0, 0.0, self.width, self.height)
+        sheet.set_axis_off()
         y = MARGIN
         for i, row in enumerate(tiles):
             for j, column in enumerate(columns):
                 if column in row:
-                    axes = self._axes(self._left(j), y, TILE, heights[i])
-                    _draw_tile(axes, row[column])
+                    _draw_tile(sheet, row[column], self._left(j), y, heights[i])
                 if i == 0:
                     self._text(self._left(j) + TILE / 2, y - 0.12, column, size=9)
             self._text(MARGIN - 0.13, y + heights[i] / 2, rows[i].name, size=7, rotation=90)
             y += heights[i] + GAP
+        sheet.set(xlim=(0, self.width), ylim=(self.height, 0))
         if not has_foot:
             return
         shown = sorted({i for row in rows for i in row.classes})
@@ -206,14 +209,15 @@ class _Sheet:
         axes.spines[:].set_visible(False)
 
 
-def _draw_tile(axes: "Axes", tile: _Tile) -> None:
+def _draw_tile(sheet: "Axes", tile: _Tile, x: float, y: float, height: float) -> None:
+    """A picture with its top left corner at (x, y), in inches."""
     from matplotlib.patheffects import withStroke
 
-    axes.imshow(tile.picture.numpy(), interpolation="antialiased", aspect="auto")
-    axes.set_axis_off()
+    place = (x, x + TILE, y + height, y)
+    sheet.imshow(tile.picture.numpy(), extent=place, interpolation="antialiased", aspect="auto")
     if tile.caption:
-        axes.text(
-            0.03, 0.05, plot(tile.caption), transform=axes.transAxes, color="white", fontsize=8,
+        sheet.text(
+            x + 0.03 * TILE, y + 0.95 * height, plot(tile.caption), color="white", fontsize=8,
             path_effects=[withStroke(linewidth=2, foreground="black")],
         )  # fmt: skip
 

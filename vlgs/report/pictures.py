@@ -13,9 +13,10 @@ from vlgs.fields import Field
 from vlgs.files import write_atomically
 from vlgs.names import file_names
 from vlgs.query import Prompts, Query
+from vlgs.report.answer import KeptAnswers
 from vlgs.report.draw import Painter, ViewPictures
 from vlgs.report.overview import PNG_LEVEL, count_difference, write_histogram, write_overview
-from vlgs.types import Scene
+from vlgs.types import Scene, View
 
 T = TypeVar("T")
 
@@ -41,6 +42,7 @@ def write_pictures(
     query: Query,
     prompts: Prompts | None,
     limits: PictureLimits = PictureLimits(),
+    kept: KeptAnswers | None = None,
 ) -> Path | None:
     """Draw held-out views into ``<folder>/<view>/*.png``, and ``overview.png`` over them.
 
@@ -52,15 +54,16 @@ def write_pictures(
         prompts: The scene's classes, encoded, or words for a scene without any; without either only colour, features and
             l - o are drawn, and colour alone where no language was trained. l - o needs Gaussians.
         limits: How many views and prompts.
+        kept: Answers that scores were made from; None: all are made here.
 
     Returns:
         The overview, or None if there is no held-out view.
     """
-    views = spread(scene.test, limits.views)
+    views = drawn(scene, limits)
     if not views:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    painter = Painter(field, scene, query, prompts, views)
+    painter = Painter(field, scene, query, prompts, views, kept)
     # Of all views and prompts, so that a view and a prompt have one name however few are drawn.
     folders = file_names(view.name for view in scene.test)
     names = file_names(prompts.names if prompts is not None else ())
@@ -80,6 +83,11 @@ def write_pictures(
     path = folder / "overview.png"
     write_overview(path, prompts.names if prompts else (), rows, density)
     return path
+
+
+def drawn(scene: Scene, limits: PictureLimits = PictureLimits()) -> list[View]:
+    """Held-out views that have pictures."""
+    return spread(scene.test, limits.views)
 
 
 def write_view(folder: Path, pictures: ViewPictures, names: Mapping[str, str]) -> None:

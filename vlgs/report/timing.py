@@ -33,7 +33,7 @@ def measure_fps(
     query: Query,
     prompts: Prompts | None,
     language: bool = True,
-    seconds: float = 3.0,
+    seconds: float = 1.0,
     repeats: int = 30,
 ) -> Timing:
     """Time renders and queries; warm-up is left out, and cameras take turns.

@@ -48,7 +48,9 @@ class Plain:
 
     def __call__(self, point: Float[np.ndarray, "3 n"]) -> Painted:
         """See `Pattern`."""
-        shade = 1 + self.grain * _grain(point, self.scale)
+        shade = np.ones(point.shape[1])
+        if self.grain:
+            shade += self.grain * _grain(point, self.scale)
         return np.array(self.color)[:, None] * shade, np.zeros(point.shape[1], np.uint16)
 
 

@@ -54,7 +54,7 @@ def trace(
     patch = np.zeros(count, np.uint16)
     for pane in range(_PANES):
         start = origin if origin.shape[1] == 1 else origin.take(rays, axis=1)
-        seen, cover, patches = _shade(world, hits, start, direction[:, rays], bounces)
+        seen, cover, patches = _shade(world, hits, start, direction.take(rays, axis=1), bounces)
         if pane == 0:
             patch = patches
         color[:, rays] += clear[rays] * cover * seen
@@ -64,7 +64,7 @@ def trace(
         if not rays.size:
             break
         start = origin if origin.shape[1] == 1 else origin.take(rays, axis=1)
-        hits = world.first_hit(start, direction[:, rays], t_min)
+        hits = world.first_hit(start, direction.take(rays, axis=1), t_min)
     return Traced(np.clip(color, 0.0, 1.0), first, patch)
 
 

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from vlgs.data.synthetic.lights import Light
 from vlgs.data.synthetic.objects import Part, Thing
 from vlgs.data.synthetic.room import FLOOR, LAMP, ROOM, TABLE_RADIUS
-from vlgs.data.synthetic.shapes import Vectors
+from vlgs.data.synthetic.shapes import Box, Revolution, Vectors
 
 NOTHING = 255
 """Part number of a ray that hits nothing; does not happen from inside the room."""
@@ -19,6 +19,7 @@ _NEAR_BLOCK = 2048
 """Rays whose distances to all parts stay in the cache."""
 _SHADOW_CELLS = 192
 _LIFT = 1e-4  # a shadow ray starts this far above its surface, in metres
+_HAIR = 1e-6  # distances above it are no matter of rounding, in metres
 _GLASS_PASSES = 0.7  # share of the light that one piece of glass lets through
 
 
@@ -64,6 +65,12 @@ class World:
         heights = np.array([height for height, _ in bounds])
         axes = np.stack([rotation[:, 2] for rotation in self._rotations])
         self._bound_centers = np.concatenate(self._centers, axis=1).T + axes * heights[:, None]
+        background = [things[thing].background for thing in self.thing_of_part]
+        self._extents = {
+            n: _extent(self.parts[n], bounds[n]) for n in np.flatnonzero(background).tolist()
+        }
+        """Of parts of the background, which are large: two corners of a box around each."""
+        self._boxes = {n for n in self._extents if _is_upright_box(self.parts[n])}
         # Which rays come near is decided in float32 with a millimetre to spare.
         self._bound_radii2 = np.array([[(radius + 1e-3) ** 2] for _, radius in bounds], np.float32)
         names = np.array([things[thing].name for thing in self.thing_of_part])
@@ -172,9 +179,9 @@ class World:
             direction = goal[:, None] - origin
             direction /= np.sqrt((direction**2).sum(0))
             through = np.ones(x.size)
-            near = self._near(origin, direction)
-            for number in casters:
-                rays = np.flatnonzero(near[number])
+            near = self._near(origin, direction, casters)
+            for row, number in enumerate(casters):
+                rays = np.flatnonzero(near[row] & (through > 0))
                 start, towards = origin.take(rays, axis=1), direction.take(rays, axis=1)
                 t, _ = self._intersect(number, start, towards, np.zeros(rays.size))
                 glass = self.parts[number].material.kind == "glass"
@@ -183,12 +190,16 @@ class World:
         return Shade(half, (light / len(goals)).reshape(_SHADOW_CELLS, _SHADOW_CELLS))
 
     def _near(
-        self, origin: Vectors, direction: Float[np.ndarray, "3 n"]
+        self,
+        origin: Vectors,
+        direction: Float[np.ndarray, "3 n"],
+        parts: Sequence[int] | slice = slice(None),
     ) -> Bool[np.ndarray, "parts n"]:
-        """Which rays pass through the bounding sphere of which part."""
+        """Which rays pass through the bounding sphere of which part, or of which of some parts."""
         count = direction.shape[1]
-        near = np.empty((len(self.parts), count), bool)
-        offset = self._bound_centers - origin.T if origin.shape[1] == 1 else None
+        bound_centers, bound_radii2 = self._bound_centers[parts], self._bound_radii2[parts]
+        near = np.empty((len(bound_centers), count), bool)
+        offset = bound_centers - origin.T if origin.shape[1] == 1 else None
         for first in range(0, count, _NEAR_BLOCK):
             rays = slice(first, first + _NEAR_BLOCK)
             towards = direction[:, rays]
@@ -196,13 +207,13 @@ class World:
                 distance2 = (offset * offset).sum(1, keepdims=True).astype(np.float32)
                 along = apply(offset.astype(np.float32), towards.astype(np.float32))
             else:
-                own, centers = origin[:, rays], self._bound_centers.astype(np.float32)
+                own, centers = origin[:, rays], bound_centers.astype(np.float32)
                 start = own.astype(np.float32)
                 distance2 = apply(-2 * centers, start)
                 distance2 += (centers * centers).sum(1, keepdims=True) + (start * start).sum(0)
                 along = apply(centers, towards.astype(np.float32))
                 along -= (own * towards).sum(0).astype(np.float32)
-            np.greater_equal(along * along, distance2 - self._bound_radii2, out=near[:, rays])
+            np.greater_equal(along * along, distance2 - bound_radii2, out=near[:, rays])
         return near
 
     def _intersect(
@@ -226,6 +237,8 @@ class World:
         near = self._near(origin, direction)
         for number in range(len(self.parts)):
             rays = np.flatnonzero(near[number])
+            if number in self._extents:
+                rays = rays[self._comes_closer(number, rays, origin, direction, best)]
             if not rays.size:
                 continue
             start = origin if origin.shape[1] == 1 else origin.take(rays, axis=1)
@@ -235,6 +248,36 @@ class World:
             best[rays], part[rays], face[rays] = t[closer], number, side[closer]
         return Hits(best, part, face)
 
+    def _comes_closer(
+        self,
+        number: int,
+        rays: Int[np.ndarray, " r"],
+        origin: Vectors,
+        direction: Float[np.ndarray, "3 n"],
+        best: Float[np.ndarray, " n"],
+    ) -> Bool[np.ndarray, " r"]:
+        """Which rays may meet a part of the background before the best hit that they have.
+
+        No ray does whose way up to there stays above or below the part, or inside of a box.
+        """
+        low, high = self._extents[number]
+
+        def way(axis: int) -> tuple[np.ndarray, np.ndarray]:
+            start = origin[axis] if origin.shape[1] == 1 else origin[axis].take(rays)
+            with np.errstate(invalid="ignore"):  # without a hit, along a plane: NaN, nowhere
+                end = start + best.take(rays) * direction[axis].take(rays)
+            return np.minimum(start, end), np.maximum(start, end)
+
+        first, last = way(2)
+        apart = (first > high[2] + _HAIR) | (last < low[2] - _HAIR)
+        if number in self._boxes:
+            inside = (first > low[2] + _HAIR) & (last < high[2] - _HAIR)
+            for axis in (0, 1):
+                first, last = way(axis)
+                inside &= (first > low[axis] + _HAIR) & (last < high[axis] - _HAIR)
+            apart |= inside
+        return ~apart
+
     def surface(
         self, hits: Hits, point: Float[np.ndarray, "3 n"]
     ) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "3 n"], UInt16[np.ndarray, " n"]]:
@@ -243,7 +286,9 @@ class World:
         normal[2] = 1.0
         patch = np.zeros(hits.part.shape, np.uint16)
         for number, rays in by_part(hits.part):
-            local = apply(self._rotations[number].T, point[:, rays] - self._centers[number])
+            local = apply(
+                self._rotations[number].T, point.take(rays, axis=1) - self._centers[number]
+            )
             color[:, rays], patch[rays] = self.parts[number].material.pattern(local)
             outward = self.parts[number].shape.normal(local, hits.face[rays])
             normal[:, rays] = apply(self._rotations[number], outward)
@@ -263,3 +308,20 @@ def by_part(part: UInt8[np.ndarray, " n"]) -> list[tuple[int, np.ndarray]]:
     numbers, starts = np.unique(part[order], return_index=True)
     groups = np.split(order, starts[1:])
     return [(int(n), rays) for n, rays in zip(numbers, groups, strict=True) if n != NOTHING]
+
+
+def _extent(part: Part, bound: tuple[float, float]) -> Float[np.ndarray, "2 3"]:
+    """Lowest and highest coordinates of a part; wider than it is where it is turned."""
+    center, half = np.array(part.center), np.full(3, abs(bound[0]) + bound[1])
+    shape = part.shape
+    if _is_upright_box(part) and isinstance(shape, Box):
+        half = np.array(shape.half)
+    if isinstance(shape, Revolution) and part.rotation == Part.rotation:
+        reach = np.array([bound[1], bound[1], 0.0])
+        ends = np.array([[0.0, 0.0, shape.low], [0.0, 0.0, shape.high]])
+        return center + ends + np.stack([-reach, reach])
+    return np.stack([center - half, center + half])
+
+
+def _is_upright_box(part: Part) -> bool:
+    return isinstance(part.shape, Box) and part.rotation == Part.rotation
