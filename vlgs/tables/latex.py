@@ -1,7 +1,8 @@
 """A table in LaTeX, in the paper's arrangement: groups, check marks, best bold, second underlined."""
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from vlgs.tables.fill import Filled
 from vlgs.tables.grid import (
@@ -14,6 +15,8 @@ from vlgs.tables.grid import (
     has_paper,
     number,
 )
+from vlgs.tables.quantities import QUANTITIES
+from vlgs.tables.registry import is_label
 from vlgs.text import latex as escape
 from vlgs.text import visible
 
@@ -24,14 +27,14 @@ PREAMBLE = r"""\documentclass{article}
 
 
 def to_latex(filled: Filled) -> str:
-    """A `table` environment that needs booktabs, multirow and amssymb."""
+    """A `table` environment that needs booktabs, multirow, amssymb and graphicx; what is larger than a page shrinks."""
     grid = arrange(filled)
     grouped = any(line.group for line in grid.lines)
     paper = has_paper(filled)
     lead = ["l"] * grouped + ["l"] + ["c"] * len(grid.mark_names)
     numbers = ["c"] * len(grid.headers)
     names = [""] * grouped + ["Category" if filled.table.by_category else "Method"]
-    head = [*map(escape, names), *map(escape, grid.mark_names), *map(escape, grid.headers)]
+    head = _head(filled, grid, [*names, *grid.mark_names])
     body = [_line(line, grid, grouped, paper) for line in grid.lines]
     rows = _with_groups(grid, body, grouped)
     return "\n".join(
@@ -41,33 +44,88 @@ def to_latex(filled: Filled) -> str:
             r"\centering",
             rf"\caption{{{escape(caption(filled))}}}",
             rf"\label{{tab:{filled.table.label}}}",
+            r"\resizebox*{!}{\ifdim\totalheight>.8\textheight.8\textheight\else\totalheight\fi}{%",
             r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{{''.join([*lead, *numbers])}}}",
             r"\toprule",
-            " & ".join(head) + r" \\",
+            *head,
             r"\midrule",
             *rows,
             r"\bottomrule",
-            r"\end{tabular}}",
+            r"\end{tabular}}}",
+            r"\par\smallskip",
+            rf"\parbox{{\linewidth}}{{\footnotesize\raggedright {escape(note(filled))}}}",
             r"\end{table}",
             "",
         ]
     )
 
 
-def document(title: str, labels: Sequence[str]) -> str:
-    """A document that inputs `<label>.tex` of every label from its own folder."""
-    inputs = [rf"\input{{{label}}}" + "\n" + r"\clearpage" for label in labels]
+def document(title: str, parts: Mapping[str, Sequence[str]]) -> str:
+    """A document that inputs `<label>.tex` of every label.
+
+    Args:
+        title: Of the document.
+        parts: Folder -> labels of the tables in it. The empty name is the document's own folder; each other one is a section, in which
+            labels begin with its name, since two folders may have tables of one label.
+    """
     return "\n".join(
         [
             PREAMBLE,
             rf"\title{{{escape(title)}}}",
             r"\begin{document}",
-            *inputs,
+            *(line for folder, labels in parts.items() for line in _part(folder, labels)),
             r"\end{document}",
             "",
         ]
     )
+
+
+def _part(folder: str, labels: Sequence[str]) -> Iterator[str]:
+    inputs = [rf"\input{{{folder + '/' * bool(folder)}{label}}}" for label in labels]
+    inputs = [f"{line}\n\\clearpage" for line in inputs]
+    if not folder or not labels:
+        yield from inputs
+    elif is_label(folder):
+        yield rf"\section*{{{escape(folder)}}}"
+        yield rf"{{\let\plain\label \renewcommand{{\label}}[1]{{\plain{{{folder}:#1}}}}"
+        yield from inputs
+        yield "}"
+    else:
+        yield f"% left out, as LaTeX cannot be told this name of a folder: {visible(folder)}"
+
+
+def note(filled: Filled) -> str:
+    """What a reader must know of the numbers beside their caption: of how many runs, of which data and protocol. Units are in the heads."""
+    counts = sorted({cell.seeds for cell in filled.cells.values() if cell.seeds})
+    if not counts:
+        return "No runs."
+    known = [scene for scene in filled.benchmark.scenes if scene in set(filled.runs["scene"])]
+    seeds = " to ".join(str(n) for n in sorted({counts[0], counts[-1]}))
+    protocols = ", ".join(sorted(set(filled.runs["protocol"].dropna()))) or "not recorded"
+    return (
+        f"Benchmark {filled.benchmark.name}. n: {seeds} seed{'s' * (counts[-1] > 1)} on each of {len(known)} "
+        f"scene{'s' * (len(known) > 1)} ({', '.join(known)}), {len(filled.runs)} runs. Protocol {protocols}; results version "
+        f"{filled.results_version}. Run with {' '.join(filled.benchmark.overrides)}."
+    )
+
+
+def _head(filled: Filled, grid: Grid, names: Sequence[str]) -> list[str]:
+    """Names of columns; where scenes have several quantities each, the scenes stand above them."""
+    if filled.table.by_category or 1 in (len(filled.columns), len(filled.table.metrics)):
+        return [" & ".join(map(escape, (*names, *grid.headers))) + r" \\"]
+    above, rules, at = [""] * len(names), [], len(names) + 1
+    for column, entries in itertools.groupby(grid.columns, key=lambda one: one[0]):
+        count = len(list(entries))
+        above.append(rf"\multicolumn{{{count}}}{{c}}{{{escape(column)}}}")
+        rules.append(rf"\cmidrule(lr){{{at}-{at + count - 1}}}")
+        at += count
+    titles = [QUANTITIES[metric].title for _, metric in grid.columns]
+    return [
+        " & ".join(above) + r" \\",
+        " ".join(rules),
+        " & ".join(map(escape, (*names, *titles))) + r" \\",
+    ]
 
 
 def _line(line: Line, grid: Grid, grouped: bool, paper: bool) -> str:
