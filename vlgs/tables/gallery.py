@@ -4,11 +4,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 from vlgs.files import write_changed
 from vlgs.tables.registry import is_label
-from vlgs.values import require_choice, require_fields, require_range
+from vlgs.values import require_range, require_types
 
 FILE = "gallery.json"
 FOLDER = "gallery"
@@ -38,7 +38,6 @@ class Shown:
     """Of the word in this view, in [0, 1], as the run was scored."""
 
     def __post_init__(self) -> None:
-        require_fields(FILE, self)
         require_range(FILE, 0, 1, iou=self.iou)
 
     @property
@@ -70,8 +69,6 @@ class GalleryView:
     rows: Sequence[Shown]
 
     def __post_init__(self) -> None:
-        require_fields(FILE, self)
-        require_choice(FILE, "place", self.place, ("lowest", "highest"))
         require_range(FILE, 1, _LARGEST, width=self.width, height=self.height)
         if not is_label(self.tab):
             raise ValueError(f"{FILE}: tab must be the label of a table, got {self.tab!r:.80}")
@@ -126,16 +123,18 @@ def _content(path: Path) -> list[Any]:
 
 
 def _view(content: Any) -> GalleryView:
-    known = _keys(GalleryView, content)
-    if not isinstance(known["rows"], list):
-        raise ValueError("rows that are no list")
-    return GalleryView(**{**known, "rows": tuple(Shown(**_keys(Shown, r)) for r in known["rows"])})
+    known = _checked(GalleryView, content)
+    return GalleryView(
+        **{**known, "rows": tuple(Shown(**_checked(Shown, one)) for one in known["rows"])}
+    )
 
 
-def _keys(kind: type[Any], content: Any) -> dict[str, Any]:
+def _checked(kind: type[Any], content: Any) -> dict[str, Any]:
+    """The arguments of a dataclass, each of its type but for rows, whose entries are looked at by themselves."""
     wanted = {field.name for field in fields(kind)}
     if not isinstance(content, dict) or set(content) != wanted:
         raise ValueError(f"an entry without just the keys {', '.join(sorted(wanted))}")
+    require_types("entry", {**get_type_hints(kind), "rows": Sequence[Any]}, content)
     return content
 
 

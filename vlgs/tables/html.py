@@ -165,7 +165,7 @@ def _section(filled: Filled, picture: str) -> dict[str, Any]:
     groups = itertools.groupby(grid.lines, key=lambda line: line.group)
     return {
         "label": filled.table.label,
-        "caption": caption(filled),
+        "caption": caption(filled).replace("+-", "±"),
         "head": [
             "category" if filled.table.by_category else "row",
             *grid.mark_names,
