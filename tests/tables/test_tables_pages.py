@@ -14,9 +14,11 @@ from urllib.parse import unquote
 import pytest
 from browser import Heard, launched, watched
 from PIL import Image
-from tables_fakes import BENCHMARK, TABLE, fake_runs, value
+from tables_fakes import BENCHMARK, TABLE, balanced, fake_runs, filled_of, value
 
+from vlgs.tables.benchmark import Benchmark
 from vlgs.tables.gallery import FILE, FOLDER, GalleryView, Shown, read_gallery, write_gallery
+from vlgs.tables.latex import to_latex
 from vlgs.tables.registry import Table, load_table
 from vlgs.tables.write import write_all
 
@@ -157,6 +159,22 @@ def test_one_document_has_all_tables_with_labels_of_their_own(results: Path):
     assert r"\multicolumn{2}{c}{glassware}" in own
     assert r"\cmidrule(lr){5-6}" in own  # after group, name and two marks
     assert own.count(r"mIoU (\%)") == 3
+
+
+def test_a_wide_table_is_panels_that_keep_scenes_whole(tiny: Table, tmp_path: Path):
+    many = Benchmark("many", ("data=synthetic",), tuple(f"s{i}" for i in range(8)), (0,))
+    fake_runs(tmp_path, [tiny], many, lambda row, scene, seed: int(scene[1:]) / 10)
+    text = to_latex(filled_of(tiny, tmp_path, many))
+    balanced(text)
+    heads = re.findall(r"\\multicolumn\{2\}\{c\}\{(\w+)\}", text)
+    assert heads == [*many.scenes, "avg"]  # each once
+    assert text.count(r"\begin{tabular}") == 2  # of 18 numbers
+    first, second = text.split(r"\end{tabular}")[:2]
+    assert "s4" in first
+    assert "avg" in second
+    for number in range(8):
+        panel = first if number < 5 else second
+        assert rf"& {10 * number:.1f} &" in panel, number
 
 
 def damaged(**more: Any) -> str:

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from vlgs.tables.fill import Filled
 from vlgs.tables.grid import (
@@ -25,18 +26,15 @@ PREAMBLE = r"""\documentclass{article}
 \usepackage{amssymb,booktabs,multirow,graphicx}
 """
 
+MOST = 12
+"""Numbers that stand side by side on a landscape page and can be read."""
+HEIGHT = 0.8
+"""Of the page, that a table may fill beside its caption and its note."""
+
 
 def to_latex(filled: Filled) -> str:
-    """A `table` environment that needs booktabs, multirow, amssymb and graphicx; what is larger than a page shrinks."""
-    grid = arrange(filled)
-    grouped = any(line.group for line in grid.lines)
-    paper = has_paper(filled)
-    lead = ["l"] * grouped + ["l"] + ["c"] * len(grid.mark_names)
-    numbers = ["c"] * len(grid.headers)
-    names = [""] * grouped + ["Category" if filled.table.by_category else "Method"]
-    head = _head(filled, grid, [*names, *grid.mark_names])
-    body = [_line(line, grid, grouped, paper) for line in grid.lines]
-    rows = _with_groups(grid, body, grouped)
+    """A `table` environment that needs booktabs, multirow, amssymb and graphicx. A wide one is panels below each other, and shrinks."""
+    panels = list(_panels(arrange(filled)))
     return "\n".join(
         [
             *(f"% {visible(line)}" for line in filled.provenance),
@@ -44,21 +42,51 @@ def to_latex(filled: Filled) -> str:
             r"\centering",
             rf"\caption{{{escape(caption(filled))}}}",
             rf"\label{{tab:{filled.table.label}}}",
-            r"\resizebox*{!}{\ifdim\totalheight>.8\textheight.8\textheight\else\totalheight\fi}{%",
-            r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-            rf"\begin{{tabular}}{{{''.join([*lead, *numbers])}}}",
-            r"\toprule",
-            *head,
-            r"\midrule",
-            *rows,
-            r"\bottomrule",
-            r"\end{tabular}}}",
-            r"\par\smallskip",
+            *(line for panel in panels for line in _panel(filled, panel, HEIGHT / len(panels))),
             rf"\parbox{{\linewidth}}{{\footnotesize\raggedright {escape(note(filled))}}}",
             r"\end{table}",
             "",
         ]
     )
+
+
+def _panels(grid: Grid) -> Iterator[Grid]:
+    """A grid in parts of at most about `MOST` numbers a line; what is of one scene stays together."""
+    names = list(dict.fromkeys(column for column, _ in grid.columns))
+    size = math.ceil(len(names) / math.ceil(len(grid.columns) / MOST))
+    for first in range(0, len(names), size):
+        shown = names[first : first + size]
+        kept = [i for i, (column, _) in enumerate(grid.columns) if column in shown]
+        yield replace(
+            grid,
+            columns=tuple(grid.columns[i] for i in kept),
+            headers=tuple(grid.headers[i] for i in kept),
+            lines=tuple(
+                replace(line, entries=tuple(line.entries[i] for i in kept)) for line in grid.lines
+            ),
+        )
+
+
+def _panel(filled: Filled, grid: Grid, height: float) -> list[str]:
+    """A tabular no wider than a line and no higher than a share of the page."""
+    grouped = any(line.group for line in grid.lines)
+    paper = has_paper(filled)
+    names = [""] * grouped + ["Category" if filled.table.by_category else "Method"]
+    columns = ["l"] * len(names) + ["c"] * (len(grid.mark_names) + len(grid.headers))
+    high = rf"{height:.2f}\textheight"
+    body = [_line(line, grid, grouped, paper) for line in grid.lines]
+    return [
+        rf"\resizebox*{{!}}{{\ifdim\totalheight>{high}{high}\else\totalheight\fi}}{{%",
+        r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{{''.join(columns)}}}",
+        r"\toprule",
+        *_head(filled, grid, [*names, *grid.mark_names]),
+        r"\midrule",
+        *_with_groups(grid, body, grouped),
+        r"\bottomrule",
+        r"\end{tabular}}}",
+        r"\par\smallskip",
+    ]
 
 
 def document(title: str, parts: Mapping[str, Sequence[str]]) -> str:
