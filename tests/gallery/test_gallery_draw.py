@@ -6,15 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from tiny_runs import TINY, composed
 
 from vlgs.gallery.__main__ import Request, draw_all, read
+from vlgs.gallery.draw import truth_of
 from vlgs.opened import open_run
 from vlgs.run import run
 from vlgs.tables.benchmark import Benchmark
 from vlgs.tables.gallery import FILE, FOLDER, GalleryView, read_gallery
 from vlgs.tables.registry import Row, Table
+from vlgs.types import IGNORE_ID, Camera, DenseLabels, ObjectLabels, Scene, View
 
 OVERRIDES = (*TINY, "trainer=smoke", "pictures=false")
 COLOR = "<b>colour</b>/.."
@@ -131,6 +134,26 @@ def test_a_damaged_field_is_named_and_nothing_is_half_written(results: Path):
     with pytest.raises(ValueError, match=str(field)):
         draw_all(request_of(results))
     assert {p: p.read_bytes() for p in (results / "mine" / FOLDER).rglob("*.*")} == before
+
+
+def test_truth_is_that_of_the_object_or_else_of_the_class():
+    ids = torch.tensor([[0, 0, 1], [2, 2, IGNORE_ID]], dtype=torch.uint8)
+    mug = torch.tensor([[True, False, False], [False, True, False]])
+    view = View(
+        "a",
+        Camera(torch.eye(4), torch.eye(3), 3, 2),
+        lambda: torch.zeros(2, 3, 3, dtype=torch.uint8),
+        read_object_labels=lambda: ObjectLabels({"mug": mug}, {}),
+        read_dense_labels=lambda: DenseLabels(ids),
+    )
+    nothing = torch.zeros(0, 3)
+    scene = Scene("s", (), (view,), "all", nothing, nothing.byte(), nothing, nothing[:, 0], classes=("mug", "wall", "floor"))  # fmt: skip
+    assert truth_of(view, scene, "mug").equal(mug)
+    assert truth_of(view, scene, "wall").equal(ids == 1)
+    with pytest.raises(
+        ValueError, match="must be those that the runs were scored on, got none of 'lid'"
+    ):
+        truth_of(view, scene, "lid")
 
 
 @pytest.mark.parametrize(

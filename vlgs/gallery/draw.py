@@ -114,9 +114,24 @@ def _choose(rows: Sequence[ScoredRow], scene: Scene, place: str, name: str) -> _
             f"gallery: held-out views of the photographs must be those of {rows[0].folder.path}, got none called {name!r}"
         )
     word = choose_word(rows, name)
-    units = read_units(view, scene.classes, read_truth(view)) if word is not None else []
-    mask = next((unit.mask for unit in units if unit.category == word), None)
-    return _Chosen(place, view, word if mask is not None else None, mask)
+    return _Chosen(place, view, word, None if word is None else truth_of(view, scene, word))
+
+
+def truth_of(view: View, scene: Scene, word: str) -> Bool[Tensor, "h w"]:
+    """The pixels that labels call by a word: as an object, or where none is labelled so, as a class of pixels.
+
+    Raises:
+        ValueError: If labels do not know the word in this view, although a run was scored on it.
+    """
+    truth = read_truth(view)
+    for unit in read_units(view, scene.classes, truth):
+        if unit.category == word:
+            return unit.mask
+    if truth is None or word not in scene.classes:
+        raise ValueError(
+            f"gallery: labels of view {view.name!r} must be those that the runs were scored on, got none of {word!r}"
+        )
+    return truth == scene.classes.index(word)
 
 
 class _Names:

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,18 @@ BENCH = {
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A plot as a PNG file."""
+
+    file: str
+    """Below the folder of its page."""
+    title: str
+    """What it shows."""
+    size: tuple[int, int] | None
+    """Width and height in pixels, so that a page keeps its shape while pictures come; None where the file does not say."""
+
+
+@dataclass(frozen=True)
 class Page:
     """What is shown of a benchmark."""
 
@@ -42,8 +55,8 @@ class Page:
     about: Sequence[str]
     """Which code, data and seeds."""
     tables: Sequence[dict[str, Any]]
-    whole: Sequence[tuple[str, str]]
-    """Title and file of pictures that are of no single table."""
+    whole: Sequence["Picture"]
+    """Those that are of no single table."""
     gallery: Sequence[GalleryView]
     notes: bool
     """Whether a README.md stands beside it."""
@@ -66,11 +79,12 @@ def write_report(
     pictures = folder / "plots"
     pictures.mkdir(exist_ok=True)
 
-    def keep(name: str, png: bytes | None) -> str:
+    def keep(name: str, title: str, png: bytes | None) -> Picture | None:
         if png is not None:
             write_changed(pictures / f"{name}.png", png)
         # Curves need the folders of runs, which a clone does not have: it shows those that were drawn where they lay.
-        return f"plots/{name}.png" if (pictures / f"{name}.png").is_file() else ""
+        kept = (pictures / f"{name}.png").is_file()
+        return _picture(folder, f"plots/{name}.png", title) if kept else None
 
     hashes = {name for table in filled for name in table.runs["config_hash"]}
     mine = frame[frame["config_hash"].isin(hashes)]
@@ -92,9 +106,13 @@ def write_report(
         name=folder.name,
         about=_about(filled),
         tables=[
-            _section(table, keep(table.table.label, plots.rows_compared(table))) for table in filled
+            _section(
+                table,
+                keep(label := table.table.label, f"{label} as a plot", plots.rows_compared(table)),
+            )
+            for table in filled
         ],
-        whole=[(title, path) for title, name, png in whole if (path := keep(name, png))],
+        whole=[found for title, name, png in whole if (found := keep(name, title, png))],
         gallery=read_gallery(folder),
         notes=(folder / "README.md").is_file(),
     )
@@ -105,18 +123,26 @@ def write_report(
 
 def write_site(results: Path, pages: Sequence[Page]) -> None:
     """Write index.html over all benchmarks, and what the benchmark of the code itself drew (`results/bench`)."""
-    found = sorted(path.name for path in (results / "bench").glob("*.png"))
+    names = sorted(path.name for path in (results / "bench").glob("*.png"))
+    bench = [_picture(results, f"bench/{name}", BENCH.get(name, name)) for name in names]
     text = (
         _environment()
         .get_template("site.html.j2")
         .render(
             pages=pages,
             notes=(results / "README.md").is_file(),
-            bench=[(name, BENCH.get(name, name)) for name in found],
+            bench=bench,
             bench_notes=(results / "bench" / "README.md").is_file(),
         )
     )
     write_changed(results / "index.html", to_bytes(text))
+
+
+def _picture(folder: Path, file: str, title: str) -> Picture:
+    with (folder / file).open("rb") as content:
+        start = content.read(24)
+    sized = len(start) == 24 and start[:8] == b"\x89PNG\r\n\x1a\n"
+    return Picture(file, title, struct.unpack(">II", start[16:]) if sized else None)
 
 
 def _environment() -> Environment:
@@ -158,7 +184,7 @@ def _listed(values: "pd.Series[Any]") -> str:
     return ", ".join(sorted(short)) or "not recorded"
 
 
-def _section(filled: Filled, picture: str) -> dict[str, Any]:
+def _section(filled: Filled, picture: Picture | None) -> dict[str, Any]:
     grid, paper = arrange(filled), has_paper(filled)
     said = say(filled)
     marks = len(grid.mark_names)

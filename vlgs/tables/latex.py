@@ -141,7 +141,7 @@ def note(filled: Filled) -> str:
 def _head(filled: Filled, grid: Grid, names: Sequence[str]) -> list[str]:
     """Names of columns; where scenes have several quantities each, the scenes stand above them."""
     if filled.table.by_category or 1 in (len(filled.columns), len(filled.table.metrics)):
-        return [" & ".join(map(escape, (*names, *grid.headers))) + r" \\"]
+        return [_heads((*names, *grid.headers))]
     above, rules, at = [""] * len(names), [], len(names) + 1
     for column, entries in itertools.groupby(grid.columns, key=lambda one: one[0]):
         count = len(list(entries))
@@ -152,8 +152,12 @@ def _head(filled: Filled, grid: Grid, names: Sequence[str]) -> list[str]:
     return [
         " & ".join(above) + r" \\",
         " ".join(rules),
-        " & ".join(map(escape, (*names, *titles))) + r" \\",
+        _heads((*names, *titles)),
     ]
+
+
+def _heads(names: Sequence[str]) -> str:
+    return " & ".join(map(escape, names)).replace(r"10\textasciicircum{}3", "$10^3$") + r" \\"
 
 
 def _line(line: Line, grid: Grid, grouped: bool, paper: bool) -> str:
