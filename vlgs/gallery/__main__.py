@@ -1,6 +1,6 @@
 """Draw the gallery of every benchmark below `results`: what each row of a table shows of the same views, and where it answers the same word.
 
-    python -m vlgs.gallery                          the rows of tab:systems, seed 0, all scenes
+    python -m vlgs.gallery                          the rows of sweeps/systems.yaml, seed 0, all scenes
     python -m vlgs.gallery name=synthetic tab=levels seed=1 scenes=glassware,mirrors
     python -m vlgs.gallery name=my-scene data.root=PATH
 
