@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +40,13 @@ TABLE = Table(
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A results folder with two runs of one scene."""
+    """A results folder with two runs of one scene, drawn once."""
     results = tmp_path_factory.mktemp("gallery")
     for row in TABLE.rows[:2]:
         assert run(composed(*OVERRIDES, *row.overrides, f"results={results}")) == 0
     benchmark = Benchmark("mine", ("data=synthetic", *OVERRIDES), ("glassware", "mirrors"), (0,))
     benchmark.extend(results / "mine" / "benchmark.yaml")
+    draw_all(request_of(results))
     return results
 
 
@@ -69,6 +71,7 @@ def views_of(results: Path) -> list[GalleryView]:
 def test_every_row_shows_its_own_render_and_its_own_answer(
     results: Path, capsys: pytest.CaptureFixture[str]
 ):
+    shutil.rmtree(results / "mine" / FOLDER)
     draw_all(request_of(results))
     said = capsys.readouterr().out
     assert "mine: glassware: 2 views by 2 rows" in said
@@ -110,7 +113,6 @@ def test_every_row_shows_its_own_render_and_its_own_answer(
 def test_what_was_drawn_stays_where_a_run_is_gone(
     results: Path, capsys: pytest.CaptureFixture[str]
 ):
-    draw_all(request_of(results))
     before = {path: path.read_bytes() for path in (results / "mine" / FOLDER).rglob("*.*")}
     shutil.rmtree(results / "runs" / views_of(results)[0].rows[1].run)
     stale = next(path for path in before if path.suffix == ".jpg").with_name("old.jpg")
@@ -127,7 +129,6 @@ def test_what_was_drawn_stays_where_a_run_is_gone(
 
 
 def test_a_damaged_field_is_named_and_nothing_is_half_written(results: Path):
-    draw_all(request_of(results))
     before = {path: path.read_bytes() for path in (results / "mine" / FOLDER).rglob("*.*")}
     field = results / "runs" / views_of(results)[0].rows[1].run / "field.safetensors"
     field.write_bytes(field.read_bytes()[:-40])
@@ -177,6 +178,14 @@ def test_arguments_are_read():
     got = read(["name=mine", "seed=3", "scenes=a, b", "tab=tab:levels", "data.root=/x y"])
     assert (got.name, got.seed, got.scenes, got.table.label) == ("mine", 3, ["a", "b"], "levels")
     assert got.places == {"root": "/x y"}
+
+
+def test_a_benchmark_without_the_options_of_a_row_is_left(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+):
+    table = replace(TABLE, rows=(Row("odd", ("data.mist=1",)),))
+    draw_all(replace(request_of(trained), table=table))
+    assert "mine: left as it is, as a row of tiny has " in capsys.readouterr().out
 
 
 def test_an_unknown_benchmark_or_scene_is_named(trained: Path, tmp_path: Path):

@@ -24,7 +24,7 @@ from vlgs.gallery.rows import ScoredRow, rows_of
 from vlgs.identity import PLACES
 from vlgs.names import file_names
 from vlgs.runs import STOPPED
-from vlgs.tables.benchmark import Benchmark, Composer
+from vlgs.tables.benchmark import Benchmark, Composer, UnknownOptionError
 from vlgs.tables.frame import read_metrics
 from vlgs.tables.gallery import FOLDER, GalleryView, read_gallery, write_gallery
 from vlgs.tables.registry import Table, choose, load_tables
@@ -112,9 +112,14 @@ def draw_all(request: Request) -> None:
     finished = read_metrics(request.results)
     for file, benchmark in zip(files, benchmarks, strict=True):
         composer = Composer(benchmark, file.parent / "recipes.json")
-        found = rows_of(
-            request.table, benchmark, composer, request.seed, finished, request.results / "runs"
-        )
+        try:
+            found = rows_of(
+                request.table, benchmark, composer, request.seed, finished, request.results / "runs"
+            )
+        except UnknownOptionError as error:  # as faults of the supervision are, of photographs
+            _say(f"{benchmark.name}: left as it is, as a row of {request.table.label} has {error}")
+            continue
+        composer.save()
         for scene, rows in found.items():
             if not request.scenes or scene in request.scenes:
                 _update(file.parent, scene, rows, request, benchmark)

@@ -121,7 +121,7 @@ def truth_of(view: View, scene: Scene, word: str) -> Bool[Tensor, "h w"]:
     """The pixels that labels call by a word: as an object, or where none is labelled so, as a class of pixels.
 
     Raises:
-        ValueError: If labels do not know the word in this view, although a run was scored on it.
+        ValueError: If labels do not know the word, although a run was scored on it.
     """
     truth = read_truth(view)
     for unit in read_units(view, scene.classes, truth):

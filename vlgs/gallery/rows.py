@@ -67,7 +67,8 @@ def rows_of(
         runs: Folder of the run folders.
 
     Raises:
-        ValueError: If a row names an option that does not exist, or a file of scores is damaged.
+        UnknownOptionError: If a row names an option that the benchmark's configuration does not have.
+        ValueError: If a file of scores is damaged.
     """
     known = {
         (run["recipe"], run["data_recipe"], str(run["scene"]), run["seed"]): run
