@@ -26,6 +26,8 @@ def test_views_are_the_lowest_and_the_highest_by_mean_over_the_rows_with_colour(
         row({"a": None, "b": None, "c": None}),
     ]
     assert choose_views(rows) == {"lowest": "b", "highest": "c"}  # 25, 20, 25.5
+    rows[0].metrics["per_view"]["d"] = {"psnr": 1.0}  # of one row alone
+    assert choose_views(rows) == {"lowest": "b", "highest": "c"}
     assert choose_views([row({"a": 20.0, "b": None})]) == {"lowest": "a"}
     assert choose_views([row({"a": None})]) == choose_views([row({})]) == choose_views([]) == {}
 
