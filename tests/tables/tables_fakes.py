@@ -120,9 +120,11 @@ def balanced(text: str) -> None:
     assert not open_ones
     plain = text.replace(r"\{", "").replace(r"\}", "")
     assert plain.count("{") == plain.count("}")
-    spec = re.search(r"\\begin\{tabular\}\{(\w+)\}", text)
-    assert spec is not None
-    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
-    assert len(rows) > 1
-    for row in rows:
-        assert row.replace(r"\&", "").count("&") == len(spec.group(1)) - 1, row
+    tabulars = re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", text, re.DOTALL)
+    assert tabulars
+    for spec, body in tabulars:
+        rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+        assert len(rows) > 1
+        for row in rows:
+            spanned = sum(int(count) - 1 for count in re.findall(r"\\multicolumn\{(\d+)\}", row))
+            assert row.replace(r"\&", "").count("&") + spanned == len(spec) - 1, row

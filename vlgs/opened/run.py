@@ -103,7 +103,7 @@ def open_run(
     run = RunFolder(path)
     if not run.config.is_file():
         raise ValueError(f"{path}: must be the folder of a run, with config.yaml in it, got none")
-    config = _config(path)
+    config = read_config(path)
     notes = read_scene(run)
     field, step = _field(run, partial(_make, config))
     field = field if within is None else faster(field, within)
@@ -111,7 +111,12 @@ def open_run(
     return OpenedRun(path, field, notes, instantiate(config.query), known, step)
 
 
-def _config(path: Path) -> DictConfig:
+def read_config(path: Path) -> DictConfig:
+    """The configuration of a run folder in today's words. It names no class but ours.
+
+    Raises:
+        ValueError: If it is not that of a run.
+    """
     try:
         config = as_today(found_again(path.resolve()))
         check_targets(config, plugins=())  # a file's word is nobody's trust

@@ -3,12 +3,13 @@
     python -m vlgs.tables                  the tables that stand in each benchmark's folder (with a benchmark.yaml), again
     python -m vlgs.tables tab=ab-multi     one table; several: tab=ab-multi,ab-cam; all that have runs: tab=all
     python -m vlgs.tables results=FOLDER   other than ./results
-    python -m vlgs.tables html=true        index.html with plots too
+    python -m vlgs.tables html=true        index.html of each benchmark, with plots, and one page over all of them too
     python -m vlgs.tables FOLDER           one line for each run of any folder of runs: what differs, scores, where it lies
     python -m vlgs.tables FOLDER write=F   the same to a file F.csv or F.md
 
 Writes results/runs.csv (one row per run) and categories.csv (one per run and category; both in runs.parquet with pyarrow), and per
-benchmark <label>.csv, .md and .tex, <label>-claims.csv with every difference, interval and verdict, and tables.tex over all of them.
+benchmark <label>.csv, .md and .tex, <label>-claims.csv with every difference, interval and verdict, and tables.tex over all of them; and
+results/tables.tex over all benchmarks. Pages show the pictures that `python -m vlgs.gallery` drew.
 Nothing is trained, and nothing that has no run is filled in. Runs that stand in runs.csv and have no folder here, as in a fresh clone, stay;
 delete the file to leave them out. A table of runs of earlier code is written from them and says so.
 """

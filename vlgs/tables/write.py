@@ -43,8 +43,8 @@ def write_all(
         results: Folder of the runs and of the benchmarks.
         tables: Which to write. One without a single run is left out, and so is one with options that the data of a benchmark do not
             have (faults of the supervision, on photographs). One that another stands for elsewhere is that one.
-        name: Only the tables of this benchmark.
-        html: Write index.html with its plots too, of these tables.
+        name: Only the tables of this benchmark, and nothing that is of all benchmarks.
+        html: Write index.html of each benchmark with its plots too, and that over all, of these tables.
         again: In a folder that has some of the tables, write those only.
 
     Returns:
@@ -81,12 +81,16 @@ def write_all(
     write_lines(lines, results)
     for folder, one in found.items():
         write_tables(folder, one.filled)
-        if html:
-            from vlgs.tables.html import (
-                write_report,  # matplotlib, which the tables alone do not wait for
-            )
+    if name is None:
+        write_document(results, list(found))
+    if html:
+        # Matplotlib, which the tables alone do not wait for.
+        from vlgs.tables.html import write_report, write_site
 
-            write_report(folder, one.filled, tidy(lines), results)
+        frame = tidy(lines)
+        pages = [write_report(folder, one.filled, frame, results) for folder, one in found.items()]
+        if name is None:
+            write_site(results, pages)
     fitting = {label for one in found.values() for label in one.fitting}
     for one in found.values():
         for label in one.refused.keys() - fitting:
@@ -188,7 +192,17 @@ def write_tables(folder: Path, filled: Sequence[Filled]) -> None:
             path.unlink(missing_ok=True)  # of runs that were more
         else:
             write_changed(path, to_bytes(claims))
-    stems = (path.stem for path in folder.glob("*.tex"))
-    labels = sorted(stem for stem in stems if stem != "tables" and is_label(stem))
-    text = document(f"Ablations on {folder.name}", labels)
+    text = document(f"Ablations on {folder.name}", {"": _labels(folder)})
     write_changed(folder / "tables.tex", to_bytes(text))
+
+
+def write_document(results: Path, folders: Sequence[Path]) -> None:
+    """One LaTeX document over the tables of all benchmarks."""
+    text = document("vlgs: results", {folder.name: _labels(folder) for folder in folders})
+    write_changed(results / "tables.tex", to_bytes(text))
+
+
+def _labels(folder: Path) -> list[str]:
+    """Of the tables in LaTeX that stand in a folder."""
+    stems = (path.stem for path in folder.glob("*.tex"))
+    return sorted(stem for stem in stems if stem != "tables" and is_label(stem))
