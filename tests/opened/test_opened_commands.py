@@ -12,7 +12,7 @@ from tiny_runs import TINY, composed
 
 from vlgs.fields import HasDepth
 from vlgs.gaussians.ply import read_ply
-from vlgs.opened import OpenedRun
+from vlgs.opened import OpenedRun, open_run
 from vlgs.opened.answers import ask_view, ranges, select_gaussians
 from vlgs.query.__main__ import main as query
 from vlgs.render.__main__ import main as render
@@ -62,8 +62,8 @@ def test_the_table_lists_views_and_can_do_without_pictures(
     assert not (finished / "answers").exists()
 
 
-def test_gaussians_that_answer_become_a_file(finished: Path, opened: OpenedRun, tmp_path: Path):
-    path = tmp_path / "table.ply"
+def test_gaussians_that_answer_become_a_file(finished: Path, tmp_path: Path):
+    path, opened = tmp_path / "table.ply", open_run(finished, within=0.0)  # as the command does
     query([str(finished), "wooden table", "--no-pictures", "--select", str(path), "--threshold", "0.2"])  # fmt: skip
     asked = opened.ask(["wooden table"])
     bounds = ranges(opened.field, [one.camera for one in opened.held_out()], asked)

@@ -106,8 +106,8 @@ def test_a_checkpoint_of_before_is_told_the_new_name(tiny_scene: Scene):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("gaussians.init_features=lifted",), "head must be autoencoder or identity with gaussians.init_features=lifted, .* got linear"),
-        (("sharing=lifted", "indicator=opacity"), "head must be autoencoder or identity with sharing=lifted, as nothing trains it, got linear"),
+        (("gaussians.init_features=lifted",), "head must be autoencoder or identity or principal with gaussians.init_features=lifted, .* got linear"),
+        (("sharing=lifted", "indicator=opacity"), "head must be autoencoder or identity or principal with sharing=lifted, as nothing trains it, got linear"),
         (("head.width=100",), "width must be the embedding width 512, got 100"),
         (("head.learning_rate=1.5",), "learning_rate must be 0 to 1, got 1.5"),
     ],
