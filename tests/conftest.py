@@ -116,7 +116,7 @@ def frame_rates_of_few_views() -> Iterator[None]:
 
 
 WHOLE_RUNS = frozenset(
-    {"bench", "export", "fuzz", "opened", "query", "render", "run", "stress", "view"}
+    {"bench", "export", "fuzz", "gallery", "opened", "query", "render", "run", "stress", "view"}
 )
 
 

@@ -21,6 +21,7 @@ def header(path: Path) -> set[str]:
     return {line[2:].partition(":")[0] for line in lines}
 
 
+@pytest.mark.slow
 def test_kernel_times_both_parts_and_the_reference(tmp_path: Path):
     size = Size(60, 32, 24, 1.0, Figures(2.0, (6.0, 3.0)), Figures(4.0, (16.0, 8.0)))
     dense = [Size(20, 16, 12)]

@@ -164,6 +164,7 @@ def test_memory_grows_with_the_image(tmp_path: Path):
     assert extra[1] - extra[0] > 75
 
 
+@pytest.mark.slow
 def test_error_and_pareto_write_their_files(tmp_path: Path, w: Workload):
     assert error.run_error({"tiny": w}, None, [1], 1, tmp_path, 0) == []
     table = read_record(tmp_path / "error.csv")

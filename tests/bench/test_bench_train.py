@@ -66,6 +66,7 @@ def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert again[0].seconds == pytest.approx(rows[0].seconds, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_rows_of_other_seeds_stay_and_effects_are_paired_by_seed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

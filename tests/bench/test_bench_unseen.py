@@ -48,7 +48,6 @@ def test_methods_of_several_stages_are_measured_too(tmp_path: Path):
     (row,) = read_record(tmp_path / "unseen.csv").itertuples()
     assert row.recipe == "best"
     assert 0 <= float(row.miou) <= 1  # type: ignore[arg-type]
-    assert main([*command, "--recipe", "lerf", "--override", "method=lerf", *few]) == 1
 
 
 def test_spread_is_over_seeds_and_worst_over_views():

@@ -20,7 +20,7 @@ from vlgs.tables.gallery import FILE, FOLDER, GalleryView, read_gallery
 from vlgs.tables.registry import Row, Table
 from vlgs.types import IGNORE_ID, Camera, DenseLabels, ObjectLabels, Scene, View
 
-OVERRIDES = (*TINY, "trainer=smoke", "pictures=false")
+OVERRIDES = (*TINY, "trainer=smoke", "trainer.iterations=8", "pictures=false")
 COLOR = "<b>colour</b>/.."
 """A label that is no name of a file."""
 TABLE = Table(

@@ -150,6 +150,7 @@ def test_threads_and_repeats_do_not_change_a_bit():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+@pytest.mark.slow
 def test_every_instruction_set_has_the_same_bits():
     others = [isa for isa in _csrc.isas().split() if isa != _csrc.isa()]
     if not others:

@@ -13,6 +13,7 @@ from vlgs.bench.record import read_record
 SLOW = (
     "N1 poisoned gradients",
     "N1 hostile training",
+    "N12 threads and repeats, v4",
     "N12 threads and repeats, v3",
     "N12 threads and repeats, base",
 )

@@ -288,6 +288,7 @@ def test_runs_without_a_folder_stay_beside_new_ones(
     assert set(frame["miou"][frame["seed"] > 0]) == {0.9}
 
 
+@pytest.mark.slow
 def test_tables_without_torch_on_400_runs(tmp_path: Path):
     tables = [t for t in load_tables().values() if t.label in ("ab-multi", "ab-cam", "value")]
     many = Benchmark(

@@ -169,6 +169,7 @@ def test_the_picture_and_the_gaussians_of_a_word_are_downloaded(page: Page, show
     assert 0 < len(vertices) < shown.count
 
 
+@pytest.mark.slow
 def test_two_browsers_have_a_picture_each_and_a_closed_one_ends(
     server: Serving, browser: Any, page: Page, shown: Shown
 ):
@@ -185,6 +186,7 @@ def test_two_browsers_have_a_picture_each_and_a_closed_one_ends(
     page.wait_for("mug: 0")
 
 
+@pytest.mark.slow
 def test_two_runs_are_shown_in_one_picture(browser: Any, folder: Path):
     with (
         serving(str(folder), str(folder)) as both,
