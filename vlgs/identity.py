@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vlgs.known import OPEN, former, is_group, join, last, nodes, option, targets
 
-RESULTS_VERSION = 7
+RESULTS_VERSION = 6
 """Part of every run id; raised by a change that can move a number."""
 
 _MAPS = ("augment.extractor.segmenter", "augment.extractor.encoder")
@@ -72,7 +72,6 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
-    "head.training.axes": None,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "query.masks": None,
     "stages": None,
@@ -152,8 +151,7 @@ def _counted(node: Any, key: str = "") -> dict[str, Any]:
     leaves = {former(k): v for k, v in _leaves(node, key)}
     if not key:
         leaves["loss"] = "default"  # as the group counted while one class held all terms
-    without = {former(k): v for k, v in AS_WITHOUT.items()}
-    return {k: v for k, v in leaves.items() if k not in without or without[k] != v}
+    return {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
 
 
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:

@@ -122,43 +122,6 @@ def test_layers_are_those_of_langsplat():
     }  # fmt: skip
 
 
-def test_a_fit_in_principal_axes_leaves_what_lies_across_them_out():
-    mean, *axes = torch.eye(64)[:4]  # spread 0.5, 0.4, 0.3 along three axes, and 0.05 along all 64
-    spread = 0.5 * draw(80, 1, seed=1) * axes[0] + 0.4 * draw(80, 1, seed=2) * axes[1]
-    spread += 0.3 * draw(80, 1, seed=3) * axes[2] + 0.05 * draw(80, 64, seed=4)
-    vectors = normalize(mean + spread)
-    settings = AutoencoderTraining(steps=60, batch=32, axes=3)
-    head = Autoencoder(encoder_widths=(16, 8), decoder_widths=(8, 16), training=settings)
-    head.fit(vectors, torch.ones(80))
-    first, last = head.state_dict()["encoder.0.weight"], head.state_dict()["decoder.4.weight"]
-    assert first.shape == (16, 64)
-    assert last.shape == (64, 16)
-    # Of the axes and the mean, four directions in all, and these are close to the ones that were put in.
-    assert torch.linalg.matrix_rank(first, rtol=1e-4) == torch.linalg.matrix_rank(last, rtol=1e-4) == 4  # fmt: skip
-    decoded = head.decode(draw(50, 3, seed=5))
-    assert decoded[:, 4:].norm(dim=1).max() < 0.15 < decoded[:, 1:4].norm(dim=1).mean()
-    # What was measured in coordinates is what whole vectors give.
-    cosines = (head.decode(head.encode(vectors)) * vectors).sum(1)
-    assert head.reconstruction == pytest.approx(cosines.mean().item(), abs=1e-6)
-
-
-def test_batches_are_larger_where_there_is_more_to_tell_apart():
-    assert AutoencoderTraining().drawn(1024) == 128
-    assert AutoencoderTraining().drawn(1025) == 256
-    assert AutoencoderTraining(batch=7).drawn(5000) == 7
-
-
-def test_axes_that_are_all_there_are_change_nothing():
-    vectors, areas, _ = masks(cone(5), 10, seed=2)
-    fits = []
-    for axes in (None, 63, 500):
-        settings = AutoencoderTraining(steps=20, batch=32, axes=axes)
-        fits.append(Autoencoder(encoder_widths=(16,), decoder_widths=(16,), training=settings))
-        fits[-1].fit(vectors, areas)
-    assert same(weights(fits[0]), weights(fits[1]))
-    assert same(weights(fits[0]), weights(fits[2]))
-
-
 def test_codes_and_embeddings_have_unit_length():
     head = quick(dim=4)
     assert isinstance(head, Head)

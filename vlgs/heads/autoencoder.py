@@ -23,7 +23,7 @@ from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
 
-FORMAT = "vlgs-autoencoder-5"
+FORMAT = "vlgs-autoencoder-4"
 """Part of the cache key: a change of the code that moves the weights, or of the file, changes it."""
 CHECKS = 5
 """Times that the reconstruction is measured over the last fifth of the steps; the best weights stay."""
@@ -37,15 +37,10 @@ MEASURED = 8192
 class AutoencoderTraining:
     """How the autoencoder is trained: Adam on a one-cycle schedule."""
 
-    steps: int = 400
-    batch: int | None = None
-    """Embeddings drawn for a step; None: 128, or 256 where there are more than 1024. With a hundred things in a scene 128 learn much less."""
-    learning_rate: float = 4e-3
+    steps: int = 600
+    batch: int = 256
+    learning_rate: float = 2e-3
     """At the top of the cycle."""
-    axes: int | None = 64
-    """Principal axes of the scene's embeddings, beside their mean, in which the first layer reads and the last one writes. What single masks
-    have of their own, noise for the most part, spreads over all axes and is no matter for a few numbers; without it fewer and cheaper steps
-    learn as much. None: all axes, as in LangSplat."""
     area_power: float = 0.25
     """A mask is drawn in proportion to its area to this power: at 1 a thing that covers little is never seen apart
     from its neighbours, at 0 every mask counts the same as in LangSplat."""
@@ -58,12 +53,9 @@ class AutoencoderTraining:
 
     def __post_init__(self) -> None:
         require_range("autoencoder", 2, 10**7, steps=self.steps)
-        if self.batch is not None:
-            require_range("autoencoder", 2, 2**20, batch=self.batch)
+        require_range("autoencoder", 2, 2**20, batch=self.batch)
         require_range("autoencoder", 0, 10, area_power=self.area_power, code_noise=self.code_noise)
         require_range("autoencoder", 0, 2**63 - 1, seed=self.seed)
-        if self.axes is not None:
-            require_range("autoencoder", 1, 2**20, axes=self.axes)
         if not 0.0 < self.learning_rate <= 1.0:
             raise ValueError(
                 f"autoencoder: learning_rate must be above 0 and at most 1, got {self.learning_rate}"
@@ -72,12 +64,6 @@ class AutoencoderTraining:
             raise ValueError(
                 f"autoencoder: min_coverage must be in (0, 1], got {self.min_coverage}"
             )
-
-    def drawn(self, rows: int) -> int:
-        """Size of a batch from so many embeddings that differ."""
-        if self.batch is not None:
-            return self.batch
-        return 128 if rows <= 1024 else 256
 
 
 DEFAULT_TRAINING = AutoencoderTraining()
@@ -202,7 +188,7 @@ class Autoencoder(nn.Module):
             ValueError: If nothing has been fitted or loaded.
         """
         self._require_fitted()
-        return normalize(self.decoder(codes).add_(self.mean), dim=-1)
+        return normalize(self.decoder(codes) + self.mean, dim=-1)
 
     def fold(self) -> Folded:
         """See `vlgs.heads.folded.Foldable`: the decoder without its last layer.
@@ -219,36 +205,29 @@ class Autoencoder(nn.Module):
         """Lay out both networks for an embedding width; indices and shapes are those of LangSplat's checkpoints."""
         self.encoder = nn.Sequential(nn.Linear(embedding_dim, self.encoder_widths[0]))
         for before, after in pairwise((*self.encoder_widths, self.dim)):
-            self.encoder.extend(
-                [nn.BatchNorm1d(before), nn.ReLU(inplace=True), nn.Linear(before, after)]
-            )
+            self.encoder.extend([nn.BatchNorm1d(before), nn.ReLU(), nn.Linear(before, after)])
         self.decoder = nn.Sequential(nn.Linear(self.dim, self.decoder_widths[0]))
         for before, after in pairwise((*self.decoder_widths, embedding_dim)):
-            self.decoder.extend([nn.ReLU(inplace=True), nn.Linear(before, after)])
+            self.decoder.extend([nn.ReLU(), nn.Linear(before, after)])
         self.mean = torch.zeros(embedding_dim)
         self.eval()
 
     def _fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
         settings = self.fit_settings
         generator = torch.Generator().manual_seed(settings.seed)
-        weights = areas**settings.area_power
-        mean = areas @ vectors / areas.sum() if self.center else torch.zeros(vectors.shape[1])
-        basis = None
-        if settings.axes is not None and settings.axes < vectors.shape[1] - 1:
-            basis = _principal_basis(vectors, weights, mean, settings.axes)
-            vectors = vectors @ basis.T
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
             self.build(vectors.shape[1])
-        self.mean = mean if basis is None else basis @ mean
+        if self.center:
+            self.mean = areas @ vectors / areas.sum()
         optimizer = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
         )
-        drawn = settings.drawn(len(vectors))
-        rows = torch.multinomial(weights, settings.steps * drawn, True, generator=generator)
+        draws = settings.steps * settings.batch
+        rows = torch.multinomial(areas**settings.area_power, draws, True, generator=generator)
         best: tuple[float, dict[str, Tensor]] = (-torch.inf, {})
-        for step, batch in enumerate(rows.split(drawn), start=1):
+        for step, batch in enumerate(rows.split(settings.batch), start=1):
             optimizer.zero_grad()
             self._loss(vectors[batch], step / settings.steps, generator).backward()
             optimizer.step()
@@ -259,20 +238,6 @@ class Autoencoder(nn.Module):
                     best = score, {k: v.clone() for k, v in self.state_dict().items()}
         optimizer.zero_grad()  # weights that stay as they are need no room for gradients
         self.load_state_dict(best[1])
-        if basis is not None:
-            self._widen(basis, mean)
-
-    @torch.no_grad()
-    def _widen(self, basis: Float[Tensor, "q e"], mean: Float[Tensor, " e"]) -> None:
-        """Take the coordinates of a fit into the outer layers: the same codes and embeddings, of and as whole vectors."""
-        first, last = self.encoder[0], self.decoder[-1]
-        assert isinstance(first, nn.Linear)  # `build`
-        assert isinstance(last, nn.Linear)
-        first.weight = nn.Parameter(first.weight @ basis)
-        last.weight = nn.Parameter(basis.T @ last.weight)
-        last.bias = nn.Parameter(basis.T @ last.bias)
-        first.in_features = last.out_features = basis.shape[1]
-        self.mean = mean
 
     def _loss(
         self,
@@ -387,19 +352,6 @@ def _distinct(
     rows, group = torch.unique(vectors, dim=0, return_inverse=True)
     summed = torch.zeros(len(rows)).index_add_(0, group, areas)
     return normalize(rows, dim=-1), summed
-
-
-def _principal_basis(
-    vectors: Float[Tensor, "m e"],
-    weights: Float[Tensor, " m"],
-    mean: Float[Tensor, " e"],
-    axes: int,
-) -> Float[Tensor, "q e"]:
-    """Orthonormal rows: the direction of the mean, and the axes along which the vectors vary most around it."""
-    around = (vectors - mean) * weights.sqrt()[:, None]
-    largest = torch.linalg.eigh(around.T @ around).eigenvectors[:, -axes:].flip(1)
-    # A mean of zero, where none is subtracted, leaves its column to any direction that is at right angles to the axes.
-    return torch.linalg.qr(torch.cat([mean[:, None], largest], dim=1)).Q.T.contiguous()
 
 
 def _checked_steps(steps: int) -> set[int]:
