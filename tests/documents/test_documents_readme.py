@@ -33,7 +33,7 @@ SLOW = {
     "python -m vlgs.run fusion=none indicator=opacity blend=none": SMOKE,
     "python -m vlgs.run method=langsplat fusion=self": SMOKE,
     "python -m vlgs.run -m fusion=none,mlp,cross,self seed=0,1,2": SMOKE,
-    "python -m vlgs.run data=colmap data.root=SCENE data.resize=0.5 trainer=photos": (
+    "python -m vlgs.run data=colmap data.root=SCENE data.resize=0.5 trainer=photos method=best": (
         *("data.resize=1", "trainer.iterations=10", "pictures=false", "progress=false"),
         *("gaussians.densify.start=2", "gaussians.densify.stop=5", "threads=1"),
     ),
