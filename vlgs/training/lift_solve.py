@@ -27,7 +27,7 @@ class Solve(Consensus):
 
     c are the codes of `Consensus`, m_i is what Gaussian i weighs in all images, t_p is 1 where a mask gives H_p, and `absent` where none does and H_p
     is 0. The prior decides where a Gaussian stands behind others, and keeps codes from swinging to explain faulty masks. Splat Feature Solver
-    (Xiong et al., 2025) poses the same system without a prior and takes the weighted mean for its solution.
+    (Xiong et al., 2025) sees lifting as least squares too, and takes the weighted mean for its solution.
 
     Raises:
         ValueError: If `absent` is not in [0, 1], `prior` is not positive, or `steps` is negative.
@@ -51,7 +51,12 @@ class Solve(Consensus):
         start: Float[Tensor, "n t"],
     ) -> Float[Tensor, "n t"]:
         """See `vlgs.training.lift_rules.Refining`."""
-        system = _System(model, scene, level, vectors, self.absent)
+        if not self.steps:
+            return start
+        with torch.no_grad():
+            weight = model.fuse().language_weight
+        weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
+        system = _System(model, weight, scene, level, vectors, self.absent)
         mass = system.gathered(torch.ones_like(start[:, :1]))
         scale = 1 / ((1 + self.prior) * mass).clamp_min(torch.finfo(mass.dtype).tiny)
 
@@ -106,6 +111,7 @@ class _System:
     """Renders of codes in all views that have masks, and their transpose."""
 
     model: SplatModel
+    weight: Float[Tensor, " n"]
     scene: Scene
     level: int
     vectors: Float[Tensor, "m t"]
@@ -120,19 +126,14 @@ class _System:
         return -self._back(codes, wanted=True)
 
     def _back(self, codes: Float[Tensor, "n t"], wanted: bool) -> Float[Tensor, "n t"]:
-        total, weight = torch.zeros_like(codes), self._weight()
+        total = torch.zeros_like(codes)
         for camera, target, trust in self._looks():
             values = codes.detach().requires_grad_()
             with torch.enable_grad():
-                image = self.model.render_values(camera, values, weight)
+                image = self.model.render_values(camera, values, self.weight)
                 error = trust * (image.detach() - target if wanted else image.detach())
                 total += torch.autograd.grad(image, values, error)[0]
         return total
-
-    def _weight(self) -> Float[Tensor, " n"]:
-        with torch.no_grad():
-            weight = self.model.fuse().language_weight
-        return weight if weight.dim() == 1 else weight[:, self.level].contiguous()
 
     def _looks(self) -> Iterator[tuple[Camera, Float[Tensor, "h w t"], Float[Tensor, "h w 1"]]]:
         """Of each view what it shows and how much a pixel counts."""
