@@ -41,6 +41,7 @@ QUANTITIES: dict[str, Quantity] = {
     "train_minutes": Quantity(
         "train_seconds", "Training", "min", 1.0 / 60.0, 2, False, judged=False
     ),
+    "memory_mib": Quantity("peak_rss_bytes", "Memory", "MiB", 2.0**-20, 0, False, judged=False),
     "fps_query": Quantity("fps_query", "Query", "1/s", 1.0, 1, True, judged=False),
     "n_gaussians_k": Quantity("n_gaussians", "Gaussians", "10^3", 1e-3, 1, False),
     "storage_mb": Quantity("ply_bytes", "Storage", "MB", 1e-6, 1, False),

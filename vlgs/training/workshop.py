@@ -141,6 +141,9 @@ class Workshop:
             restore(module, finished)
             return self._remember(name, module)
         module.model.sh_degree = start.sh_degree
+        module.model.requires_grad_(
+            False
+        )  # rules differentiate by what they blend, and by nothing else
         lift_features(module) if rule is None else lift_by(rule, module)
         module.next_step = module.settings.iterations
         module.train_seconds = time.perf_counter() - started
