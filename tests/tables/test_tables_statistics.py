@@ -226,6 +226,23 @@ def test_a_group_on_other_data_or_budget_is_compared_with_its_own_full_model(
     assert "Clean full" not in {d.label for d in differences}
 
 
+def test_a_table_can_name_the_row_that_others_are_compared_with(tmp_path: Path):
+    more = """
+  - {label: Worse, group: Clean, set: [fusion=none, data.faults.noise=0]}
+  - {label: Better, group: Clean, set: [blend=none, data.faults.noise=0]}
+"""
+    text = TABLE.replace("rows:", "against: Better\nrows:") + more.lstrip("\n")
+    filled = filled_of(tmp_path, text=text)
+    found = {(claim.group, claim.label): claim.mean for claim in claims(filled)}
+    assert ("", "Better") not in found
+    assert ("Clean", "Better") not in found
+    assert found["", "Worse"] == found["Clean", "Worse"] == pytest.approx(-9.0)
+    assert found["", "Full"] == pytest.approx(-4.0)
+    assert "row minus 'Better'" in say(filled).before
+    with pytest.raises(ValueError, match="against must be a row's label"):
+        filled_of(tmp_path, text=text.replace("against: Better", "against: Bettr"))
+
+
 def test_pairs_without_a_partner_are_left_out(tmp_path: Path):
     skip = [
         ("Worse", "mirrors", 0),

@@ -45,6 +45,7 @@ _TABLE_KEYS = {
     "seeds",
     "elsewhere",
     "same_runs_as",
+    "against",
     "rows",
 }
 _ROW_KEYS = {"label", "set", "group", "marks", "paper", "ours"}
@@ -94,6 +95,8 @@ class Table:
     """Table that stands for this one on other scenes than the paper's, where this would say the same of other scenes again."""
     same_runs_as: str = ""
     """Table that has all of these rows, so that on other scenes than the paper's only the paper's values are others."""
+    against: str = ""
+    """Label of the row that others are compared with; empty for the full model."""
     source: str = "sweeps"
     """File that it was read from, for errors."""
 
@@ -171,6 +174,11 @@ def load_table(path: Path) -> Table:
     )
     if not rows:
         raise ValueError(f"{where}: rows must be at least 1, got none")
+    against = _require(where, content, "against", str)
+    if against and against not in (labels := [row.label for row in rows]):
+        raise ValueError(
+            f"{where}: against must be a row's label ({', '.join(dict.fromkeys(labels))}), got {against!r}"
+        )
     return Table(
         label=label,
         number=printed,
@@ -184,6 +192,7 @@ def load_table(path: Path) -> Table:
         seeds=tuple(_require(where, content, "seeds", list, int)),
         elsewhere=_require(where, content, "elsewhere", str),
         same_runs_as=_require(where, content, "same_runs_as", str),
+        against=against,
         source=where,
     )
 

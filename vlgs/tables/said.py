@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from vlgs.tables.fill import Filled
 from vlgs.tables.intervals import FEWEST_SCENES, FEWEST_SEEDS, LEVEL
 from vlgs.tables.quantities import QUANTITIES
-from vlgs.tables.statistics import Claim, Judged, claims, full_model, orders
+from vlgs.tables.statistics import Claim, Judged, claims, compared_with, orders
 from vlgs.text import csv_line, visible
 
 CLAIM_COLUMNS = (
@@ -47,7 +47,7 @@ def say(filled: Filled) -> Said:
     head += [f"{LEVEL:.0%} interval, scenes like these"] * beyond
     head += ["scenes that agree", "P(better)"] + ["paper"] * paper + ["p (Holm)", "verdict"]
     lines = tuple(_line(c, bool(head[0] == "group"), beyond, paper) for c in found)
-    return Said(tuple(head), lines, _how_to_read(found, beyond, effects), _order(filled))
+    return Said(tuple(head), lines, _how_to_read(filled, found, beyond, effects), _order(filled))
 
 
 def claims_csv(filled: Filled) -> str | None:
@@ -103,12 +103,13 @@ def _p(value: float) -> str:
     return "below 0.001" if value < 0.001 else f"{value:.3f}"
 
 
-def _how_to_read(found: Sequence[Claim], beyond: bool, effects: bool) -> str:
+def _how_to_read(filled: Filled, found: Sequence[Claim], beyond: bool, effects: bool) -> str:
+    one = f"'{filled.table.against}'" if filled.table.against else "full model"
     judged = [claim for claim in found if claim.here]
     margins = {f"±{m:g} {q.unit}": None for c in judged if (m := (q := QUANTITIES[c.metric]).margin)}  # fmt: skip
     scenes = max(claim.scenes for claim in found)
     parts = [
-        "Differences are row minus full model of the same group, paired by scene and seed. The interval is Student's t over seeds, "
+        f"Differences are row minus {one} of the same group, paired by scene and seed. The interval is Student's t over seeds, "
         + ("on this scene alone" if scenes == 1 else f"on these {scenes} scenes")
         + f". Verdicts follow from p, which Holm's correction over all {len(judged)} differences of the table has raised, so that an "
         "interval clear of 0 may not be enough."
@@ -128,8 +129,8 @@ def _how_to_read(found: Sequence[Claim], beyond: bool, effects: bool) -> str:
     elif 1 < scenes < FEWEST_SCENES:
         parts.append(f"Nothing is said of scenes like these, which takes {FEWEST_SCENES} scenes.")
     parts.append(
-        "Scenes that agree have the sign of the mean; P(better) is how often a run of the row is better than one of the full model "
-        "on the same scene."
+        f"Scenes that agree have the sign of the mean; P(better) is how often a run of the row is better than one of "
+        f"{'' if filled.table.against else 'the '}{one} on the same scene."
     )
     if len(judged) < len(found):
         parts.append(f"Rows of fewer than {FEWEST_SEEDS} seeds make no claim.")
@@ -147,9 +148,10 @@ def _order(filled: Filled) -> str:
 
 
 def _without_claims(filled: Filled) -> str:
-    rows = filled.table.rows
+    table = filled.table
     if not any(QUANTITIES[metric].judged for metric in filled.table.metrics):
         return "Times are not judged."
-    if all(full_model(rows, row.group) is None for row in rows):
+    if all(compared_with(table, row.group) is None for row in table.rows):
         return "No row is the full model, so that nothing is compared."
-    return "No row can be compared: there is no run of the full model together with another row."
+    one = f"'{table.against}'" if table.against else "the full model"
+    return f"No row can be compared: there is no run of {one} together with another row."

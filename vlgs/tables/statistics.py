@@ -1,4 +1,4 @@
-"""What a table may claim: paired differences from the full model, effects of switches, and the order of the rows in the paper."""
+"""What a table may claim: paired differences from one row, most often the full model, effects of switches, and the order of the rows in the paper."""
 
 import itertools
 import math
@@ -20,7 +20,7 @@ from vlgs.tables.intervals import (
     probability_above,
 )
 from vlgs.tables.quantities import QUANTITIES
-from vlgs.tables.registry import AVERAGE, Row
+from vlgs.tables.registry import AVERAGE, Row, Table
 
 Verdict = Literal["holds", "reversed", "above", "below", "equivalent", "cannot be told", "no claim"]
 """``holds`` and ``reversed`` are of the paper's sign, ``above`` and ``below`` 0 where it gives none, ``equivalent`` within the margin of the
@@ -46,20 +46,20 @@ class Judged:
 
 @dataclass(frozen=True)
 class Claim:
-    """A row against the full model, or what a switch adds, paired by scene and seed."""
+    """A row against the full model, or what `Table.against` says, or what a switch adds, paired by scene and seed."""
 
     label: str
     group: str
     metric: str
     mean: float
-    """In printed units: row minus full model, or with minus without a switch."""
+    """In printed units: row minus the one it is compared with, or with minus without a switch."""
     scenes: int
     agree: int
     """Scenes whose own mean has the sign of `mean`."""
     seeds: int
     """Fewest of any scene."""
     better: float
-    """Probability that a run of the row is better than one of the full model; NaN for effects."""
+    """Probability that a run of the row is better than one of the row it is compared with; NaN for effects."""
     paper: float
     """The same difference in the paper's averages; NaN where the paper has none."""
     here: Judged | None
@@ -99,7 +99,7 @@ class _Contrast:
 def claims(filled: Filled) -> list[Claim]:
     """Every claim of a table, corrected as one family; quantities that are not judged (times) have none."""
     metrics = [m for m in filled.table.metrics if QUANTITIES[m].judged]
-    wanted = [c for m in metrics for c in (*_against_full(filled, m), *_effects(filled, m))]
+    wanted = [c for m in metrics for c in (*_against_one(filled, m), *_effects(filled, m))]
     numbers = _numbers(filled)
     found = [(c, pairs) for c in wanted if (pairs := _combined(c, numbers))]
     here = _judge(filled, found, on_these_scenes)
@@ -214,14 +214,15 @@ def _combined(
     return found
 
 
-def _against_full(filled: Filled, metric: str) -> Iterator[_Contrast]:
-    """Every row against the full model of its group, or of the table where the group has none; a run that has several rows in a group once."""
+def _against_one(filled: Filled, metric: str) -> Iterator[_Contrast]:
+    """Every row against `compared_with`; a run that has several rows in a group once."""
     if filled.table.by_category:
         return
     seen = set()
-    for index, row in enumerate(filled.table.rows):
-        reference = full_model(filled.table.rows, row.group)
-        if reference is None or index == reference or not row.overrides:
+    rows = filled.table.rows
+    for index, row in enumerate(rows):
+        reference = compared_with(filled.table, row.group)
+        if reference is None or set(row.overrides) == set(rows[reference].overrides):
             continue
         key = row.group, frozenset(row.overrides)
         if key not in seen:
@@ -249,8 +250,16 @@ def _effects(filled: Filled, metric: str) -> Iterator[_Contrast]:
             yield _Contrast(label, "", metric, weights, effect=True)
 
 
-def full_model(rows: Sequence[Row], group: str) -> int | None:
-    """Row that a group's rows are compared with."""
+def compared_with(table: Table, group: str) -> int | None:
+    """Row that a group's rows are compared with: the one of its own where it has one, else that of the table."""
+    if not table.against:
+        return _full_model(table.rows, group)
+    named = [i for i, row in enumerate(table.rows) if row.label == table.against]
+    own = [i for i in named if table.rows[i].group == group]
+    return (own or named or [None])[0]
+
+
+def _full_model(rows: Sequence[Row], group: str) -> int | None:
     full = [i for i, row in enumerate(rows) if row.overrides == ()]
     own = [i for i in full if rows[i].group == group]
     # A group on other data, or of another budget, has a full model of its own: the row that changes nothing else.

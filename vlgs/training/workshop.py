@@ -141,9 +141,8 @@ class Workshop:
             restore(module, finished)
             return self._remember(name, module)
         module.model.sh_degree = start.sh_degree
-        module.model.requires_grad_(
-            False
-        )  # rules differentiate by what they blend, and by nothing else
+        # Rules differentiate by what they blend, and by nothing else.
+        module.model.requires_grad_(False)
         lift_features(module) if rule is None else lift_by(rule, module)
         module.next_step = module.settings.iterations
         module.train_seconds = time.perf_counter() - started
