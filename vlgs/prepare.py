@@ -96,6 +96,7 @@ def text_encoder(experiment: Experiment, scene: Scene) -> TextEncoder | None:
             after training.
     """
     if scene.mask_vectors.shape[0] == 0:
+        log.info("no language supervision: training colour only, without fusion or blended views")
         return None
     text, query = experiment.make_text(vocabulary=scene.vocabulary), experiment.query
     if not words_of(scene, query):

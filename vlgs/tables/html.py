@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from vlgs.files import write_changed
 from vlgs.tables import plots
+from vlgs.tables.budget_plot import differences_by_budget
 from vlgs.tables.fill import Filled
 from vlgs.tables.frame import Line
 from vlgs.tables.gallery import GalleryView, read_gallery
@@ -108,7 +109,11 @@ def write_report(
         tables=[
             _section(
                 table,
-                keep(label := table.table.label, f"{label} as a plot", plots.rows_compared(table)),
+                keep(
+                    label := table.table.label,
+                    f"{label} as a plot",
+                    differences_by_budget(table) or plots.rows_compared(table),
+                ),
             )
             for table in filled
         ],

@@ -46,7 +46,7 @@ def rows_compared(filled: Filled) -> bytes | None:
     ]
     if not lines:
         return None
-    with _png(6.4, 0.6 + 0.16 * len(lines) * max(len(series), 1.6)) as (axes, file):
+    with png(6.4, 0.6 + 0.16 * len(lines) * max(len(series), 1.6)) as (axes, file):
         _draw(axes, lines, series, grid.headers)
         quantity = QUANTITIES[metric]
         bars = any(math.isfinite(line.entries[i].std) for line in lines for i in series)
@@ -72,7 +72,7 @@ def time_against_score(frame: pd.DataFrame, labels: Mapping[str, str]) -> bytes 
     if wide.empty or not {"miou", "train_seconds"} <= set(wide.columns):
         return None
     wide = wide.dropna()
-    with _png(6.4, 4.0) as (axes, file):
+    with png(6.4, 4.0) as (axes, file):
         for index, (recipe, row) in enumerate(wide.iterrows()):
             color = COLORS[index % len(COLORS)]
             axes.plot(row["train_seconds"], 100 * row["miou"], "o", color=color, markersize=4)
@@ -96,7 +96,7 @@ def learning_curves(curves: Mapping[str, Sequence[pd.DataFrame]]) -> bytes | Non
     """
     if not any(curves.values()):
         return None
-    with _png(6.4, 3.0) as (axes, file):
+    with png(6.4, 3.0) as (axes, file):
         for index, (scene, runs) in enumerate(curves.items()):
             for number, run in enumerate(runs):
                 axes.plot(
@@ -122,7 +122,7 @@ def indicator_by_kind(histograms: Sequence[Mapping[str, Sequence[float]]]) -> by
         return None
     kinds = sorted({kind for one in histograms for kind in one if kind != "edges"})
     edges = histograms[0]["edges"]
-    with _png(6.4, 2.6) as (axes, file):
+    with png(6.4, 2.6) as (axes, file):
         for index, kind in enumerate(kinds):
             rows = pd.DataFrame([one[kind] for one in histograms if kind in one])
             name = plot(kind.replace("_", " or "))
@@ -136,7 +136,8 @@ def indicator_by_kind(histograms: Sequence[Mapping[str, Sequence[float]]]) -> by
 
 
 @contextmanager
-def _png(width: float, height: float) -> Iterator[tuple[Axes, io.BytesIO]]:
+def png(width: float, height: float) -> Iterator[tuple[Axes, io.BytesIO]]:
+    """A figure of that size in inches, and the file that it becomes in the end."""
     file = io.BytesIO()
     with rc_context(dict(STYLE)):
         figure = Figure(figsize=(width, height), layout="constrained")

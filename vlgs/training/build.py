@@ -1,6 +1,5 @@
 """Builds a module that is ready to train from a scene and the chosen parts."""
 
-import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
@@ -28,8 +27,6 @@ from vlgs.training.lightning import VLGSModule
 from vlgs.training.settings import SkipConfig, TrainerConfig
 from vlgs.types import RasterConfig, Scene
 from vlgs.view_blend import ViewBlend
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,6 @@ def build_module(
         else:
             head.fit(scene.mask_vectors, scene.mask_areas)
     else:
-        log.info("no language supervision: training colour only, without fusion or blended views")
         fusion = NoFusion()
     config = replace(config, prune_on=pruned_on(config, parts.indicator, scene, color))
     language = scene.mask_vectors.shape[0] > 0
