@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vlgs.fields.splat import SplatModel
@@ -127,19 +127,23 @@ class _System:
 
     def _back(self, codes: Float[Tensor, "n t"], wanted: bool) -> Float[Tensor, "n t"]:
         total = torch.zeros_like(codes)
-        for camera, target, trust in self._looks():
+        for camera, index, trust in self._looks():
             values = codes.detach().requires_grad_()
             with torch.enable_grad():
                 image = self.model.render_values(camera, values, self.weight)
-                error = trust * (image.detach() - target if wanted else image.detach())
-                total += torch.autograd.grad(image, values, error)[0]
+                error = image.detach()
+                if wanted:
+                    error = (
+                        error - self.vectors[index.clamp_min(0).long()] * (index >= 0)[..., None]
+                    )
+                total += torch.autograd.grad(image, values, trust * error)[0]
         return total
 
-    def _looks(self) -> Iterator[tuple[Camera, Float[Tensor, "h w t"], Float[Tensor, "h w 1"]]]:
-        """Of each view what it shows and how much a pixel counts."""
+    def _looks(self) -> Iterator[tuple[Camera, Int[Tensor, "h w"], Float[Tensor, "h w 1"]]]:
+        """Of each view the masks it shows and how much a pixel counts."""
         for view, index in masked_views(self.scene, self.level):
             masked = (index >= 0)[..., None]
             trust = torch.where(masked, 1.0, self.absent).to(self.vectors)
             if (seen := covered(view)) is not None:
                 trust = trust * (seen[..., None] | masked)
-            yield view.camera, self.vectors[index.clamp_min(0).long()] * masked, trust
+            yield view.camera, index, trust
