@@ -1,7 +1,5 @@
 """The picture of a table whose rows are trained with several budgets: what each row differs by, over iterations."""
 
-import math
-
 from vlgs.tables.fill import Filled
 from vlgs.tables.plots import COLORS, png
 from vlgs.tables.quantities import QUANTITIES
@@ -73,7 +71,7 @@ def _budgets(filled: Filled) -> dict[str, int]:
 
 
 def _sides(claim: Claim) -> tuple[float, float]:
-    if claim.here is None or math.isnan(claim.here.low):
+    if claim.here is None:
         return 0.0, 0.0
     return claim.mean - claim.here.low, claim.here.high - claim.mean
 

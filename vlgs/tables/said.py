@@ -129,7 +129,7 @@ def _how_to_read(filled: Filled, found: Sequence[Claim], beyond: bool, effects: 
     elif 1 < scenes < FEWEST_SCENES:
         parts.append(f"Nothing is said of scenes like these, which takes {FEWEST_SCENES} scenes.")
     parts.append(
-        f"Scenes that agree have the sign of the mean; P(better) is how often a run of the row is better than one of "
+        "Scenes that agree have the sign of the mean; P(better) is how often a run of the row is better than one of "
         f"{'' if filled.table.against else 'the '}{one} on the same scene."
     )
     if len(judged) < len(found):
