@@ -1,5 +1,6 @@
 """From runs to files: damage is named, formats agree, and a clone has the same tables."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -14,7 +15,7 @@ from tables_fakes import BENCHMARK, fake_runs, filled_of, value
 from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.tables.benchmark import Benchmark
-from vlgs.tables.frame import read_lines, read_metrics, tidy, to_lines
+from vlgs.tables.frame import read_lines, read_metrics, tidy, to_lines, write_lines
 from vlgs.tables.html import write_report
 from vlgs.tables.registry import Table, load_table, load_tables
 from vlgs.tables.write import write_all, write_tables
@@ -43,6 +44,27 @@ def test_a_damaged_run_is_left_out_with_a_warning_that_names_it(
     assert f"{path}: {said}" in caplog.text
     with pytest.raises(ValueError, match=r"delete the file, and the run is reported again"):
         RunFolder(path.parent).finished()
+
+
+def test_halves_of_characters_are_spelled_out_wherever_they_stand(table: Table, tmp_path: Path):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    for path in tmp_path.glob("runs/*/metrics.json"):
+        path.write_text(
+            path.read_text().replace("a cpu", r"\ud800").replace('"pot"', r'"p\udcffot"')
+        )
+    write_lines(to_lines(read_metrics(tmp_path)), tmp_path)
+    assert r"\ud800" in (tmp_path / "runs.csv").read_text()
+    assert r"p\udcffot" in (tmp_path / "categories.csv").read_text()
+    assert {line.cpu for line in read_lines(tmp_path)} == {r"\ud800"}
+
+
+def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(table: Table, tmp_path: Path):
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    write_lines(to_lines(read_metrics(tmp_path)), tmp_path)
+    (tmp_path / "categories.csv").unlink()
+    os.mkfifo(tmp_path / "categories.csv")
+    with pytest.raises(ValueError, match=r"categories.csv: line 1 must be .* a folder or a device"):
+        read_lines(tmp_path)
 
 
 FAULTS = """

@@ -82,16 +82,21 @@ def to_lines(runs: Iterable[Mapping[str, Any]]) -> list[Line]:
         shared: dict[str, Any] = {name: run.get(name) for name in _FLAT}
         shared |= {"scene": str(run.get("scene"))}
         shared |= {name: machine.get(name) for name in ("cpu", "isa", "threads")}
-        first = (*shared.values(), None)
+        first = (*map(_storable, shared.values()), None)
         for metric, value in run.items():
             if metric in Line._fields or metric in DETAILS or isinstance(value, (str, dict, list)):
                 continue
             lines.append(Line._make((*first, metric, "", "", _number(value))))
         kinds = run.get("category_kinds") or {}
         for category, value in (run.get("per_category") or {}).items():
-            kind = kinds.get(category, "")
-            lines.append(Line._make((*first, PER_CATEGORY, category, kind, _number(value))))
+            words = (category, kinds.get(category, ""))
+            lines.append(Line._make((*first, PER_CATEGORY, *map(_storable, words), _number(value))))
     return lines
+
+
+def _storable(value: Any) -> Any:
+    """Text as runs.csv holds it: neither a file nor a column of pyarrow's takes halves of characters."""
+    return to_bytes(value).decode() if isinstance(value, str) else value
 
 
 def read_lines(results: Path) -> list[Line]:
@@ -133,6 +138,8 @@ def read_lines(results: Path) -> list[Line]:
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and cells of a CSV file."""
+    if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        raise ValueError(_damaged(path, 1, "a folder or a device"))
     content = path.read_bytes()
     try:
         text = content.decode()
