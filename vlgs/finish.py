@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vlgs.experiment import Experiment
-from vlgs.fields import Field
+from vlgs.fields import Field, HasGaussians
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.identity import RESULTS_VERSION
 from vlgs.known import option
@@ -69,12 +69,16 @@ def report(
         first, *_, last = progress.scenes
         whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
         evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
+    counted = isinstance(field, HasGaussians)
+    if not counted:
+        none = {"n_gaussians": "the field is not made of Gaussians"}
+        evaluation = replace(evaluation, reasons={**evaluation.reasons, **none})
     cameras = [view.camera for view in scene.test or scene.train]
     timing = measure_fps(field, cameras, query, prompts, language)
     if experiment.pictures:
         write_pictures(folder.renders, field, scene, query, prompts, kept=kept)
     extra = {
-        "n_gaussians": sum(made.gaussians for made in workshop.kept),
+        "n_gaussians": sum(made.gaussians for made in workshop.kept) if counted else None,
         "levels": [level for level in ready.scenes if level is not None] if language else [],
         "level_models": experiment.level_models,
         "query": _query(experiment) if language else None,

@@ -19,6 +19,7 @@ from tables_fakes import BENCHMARK, TABLE, balanced, fake_runs, filled_of, value
 from vlgs.tables.benchmark import Benchmark
 from vlgs.tables.gallery import FILE, FOLDER, GalleryView, Shown, read_gallery, write_gallery
 from vlgs.tables.latex import to_latex
+from vlgs.tables.markdown import to_markdown
 from vlgs.tables.registry import Table, load_table
 from vlgs.tables.write import write_all
 
@@ -167,14 +168,27 @@ def test_a_wide_table_is_panels_that_keep_scenes_whole(tiny: Table, tmp_path: Pa
     text = to_latex(filled_of(tiny, tmp_path, many))
     balanced(text)
     heads = re.findall(r"\\multicolumn\{2\}\{c\}\{(\w+)\}", text)
-    assert heads == [*many.scenes, "avg"]  # each once
-    assert text.count(r"\begin{tabular}") == 2  # of 18 numbers
-    first, second = text.split(r"\end{tabular}")[:2]
-    assert "s4" in first
-    assert "avg" in second
+    assert heads == ["avg", *many.scenes]  # each once
+    assert text.count(r"\begin{tabular}") == 3  # of 18 numbers
+    means, first, second = text.split(r"\end{tabular}")[:3]
+    assert "avg" in means
+    assert "s3" in first
     for number in range(8):
-        panel = first if number < 5 else second
+        panel = first if number < 4 else second
         assert rf"& {10 * number:.1f} &" in panel, number
+    parts = to_markdown(filled_of(tiny, tmp_path, many)).split("\n\n")[2:5]
+    assert [part.count(" mIoU (%)") for part in parts] == [1, 4, 4]
+    assert all(part.count("\n") == 1 + len(tiny.rows) for part in parts)
+
+
+def test_a_field_without_gaussians_is_not_the_smallest(tiny: Table, tmp_path: Path):
+    table = replace(tiny, metrics=("n_gaussians_k",))
+    fake_runs(tmp_path, [table], BENCHMARK, value)
+    path = min(tmp_path.glob("runs/*/metrics.json"))
+    path.write_text(path.read_text().replace('"n_gaussians": 20000', '"n_gaussians": 0'))
+    filled = filled_of(table, tmp_path, BENCHMARK)
+    counts = [number.value for number in filled.numbers]
+    assert set(counts) == {20.0}
 
 
 def damaged(**more: Any) -> str:

@@ -92,7 +92,10 @@ def fill(table: Table, benchmark: Benchmark, recipes: Recipes, frame: pd.DataFra
     mine = frame[frame["recipe"].isin(rows["recipe"])]
     mine = mine[mine["scene"].isin(scenes) & mine["seed"].isin(table.chosen(benchmark.seeds))]
     found = rows.merge(mine, on=["recipe", "data_recipe"]).merge(_entries(table), on="metric")
-    numbers = found.assign(value=found["value"] * found["factor"], metric=found["name"])
+    # Of fields without Gaussians earlier runs said 0, which would be the best count of all.
+    known = (found["metric"] != "n_gaussians") | (found["value"] > 0)
+    value = found["value"].where(known) * found["factor"]
+    numbers = found.assign(value=value, metric=found["name"])
     if table.by_category:
         numbers = _of_categories(table, numbers, several).dropna(subset="value")
         numbers = pd.concat([numbers, _kind_means(numbers)])

@@ -1,7 +1,7 @@
 """The layout of a table, shared by LaTeX, Markdown and HTML."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from vlgs.identity import RESULTS_VERSION
@@ -10,6 +10,8 @@ from vlgs.tables.quantities import QUANTITIES
 from vlgs.tables.registry import AVERAGE
 
 MISSING = "--"
+MOST = 12
+"""Numbers that stand side by side on a landscape page and can be read."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,34 @@ def arrange(filled: Filled) -> Grid:
     headers = tuple(titles[m] if single else f"{c} {titles[m]}" for c, m in columns)
     mark_names = next((tuple(row.marks) for row in table.rows if row.marks), ())
     return Grid(mark_names, columns, headers, tuple(_ranked(lines, columns)), ())
+
+
+def in_panels(grid: Grid) -> list[Grid]:
+    """A wide grid in parts that are read below each other: means over scenes first, then at most about `MOST` numbers a line.
+
+    What is of one scene stays together.
+    """
+    if len(grid.columns) <= MOST:
+        return [grid]
+    names = list(dict.fromkeys(column for column, _ in grid.columns))
+    means = [name for name in names if name == AVERAGE]
+    others = [name for name in names if name != AVERAGE]
+    numbers = len(grid.columns) // len(names) * len(others)
+    size = math.ceil(len(others) / math.ceil(numbers / MOST))
+    parts = [others[first : first + size] for first in range(0, len(others), size)]
+    return [_narrowed(grid, part) for part in ([means] if means else []) + parts]
+
+
+def _narrowed(grid: Grid, shown: Sequence[str]) -> Grid:
+    kept = [i for i, (column, _) in enumerate(grid.columns) if column in shown]
+    return replace(
+        grid,
+        columns=tuple(grid.columns[i] for i in kept),
+        headers=tuple(grid.headers[i] for i in kept),
+        lines=tuple(
+            replace(line, entries=tuple(line.entries[i] for i in kept)) for line in grid.lines
+        ),
+    )
 
 
 def _by_category(filled: Filled, cells: Mapping[Place, Entry]) -> Grid:

@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 from vlgs.tables.fill import Filled
 from vlgs.tables.grid import (
@@ -14,6 +13,7 @@ from vlgs.tables.grid import (
     arrange,
     caption,
     has_paper,
+    in_panels,
     number,
 )
 from vlgs.tables.quantities import QUANTITIES
@@ -26,15 +26,13 @@ PREAMBLE = r"""\documentclass{article}
 \usepackage{amssymb,booktabs,multirow,graphicx}
 """
 
-MOST = 12
-"""Numbers that stand side by side on a landscape page and can be read."""
 HEIGHT = 0.8
 """Of the page, that a table may fill beside its caption and its note."""
 
 
 def to_latex(filled: Filled) -> str:
     """A `table` environment that needs booktabs, multirow, amssymb and graphicx. A wide one is panels below each other, and shrinks."""
-    panels = list(_panels(arrange(filled)))
+    panels = in_panels(arrange(filled))
     return "\n".join(
         [
             *(f"% {visible(line)}" for line in filled.provenance),
@@ -48,23 +46,6 @@ def to_latex(filled: Filled) -> str:
             "",
         ]
     )
-
-
-def _panels(grid: Grid) -> Iterator[Grid]:
-    """A grid in parts of at most about `MOST` numbers a line; what is of one scene stays together."""
-    names = list(dict.fromkeys(column for column, _ in grid.columns))
-    size = math.ceil(len(names) / math.ceil(len(grid.columns) / MOST))
-    for first in range(0, len(names), size):
-        shown = names[first : first + size]
-        kept = [i for i, (column, _) in enumerate(grid.columns) if column in shown]
-        yield replace(
-            grid,
-            columns=tuple(grid.columns[i] for i in kept),
-            headers=tuple(grid.headers[i] for i in kept),
-            lines=tuple(
-                replace(line, entries=tuple(line.entries[i] for i in kept)) for line in grid.lines
-            ),
-        )
 
 
 def _panel(filled: Filled, grid: Grid, height: float) -> list[str]:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from vlgs.tables.fill import Cell, Filled, Place
-from vlgs.tables.grid import Entry, arrange, caption, has_paper, number
+from vlgs.tables.grid import Entry, Grid, arrange, caption, has_paper, in_panels, number
 from vlgs.tables.said import say
 from vlgs.text import csv_line, visible
 from vlgs.text import markdown as escape
@@ -12,17 +12,7 @@ from vlgs.text import markdown as escape
 
 def to_markdown(filled: Filled) -> str:
     """Caption, table, what may be claimed of it, and where the numbers come from."""
-    grid, paper = arrange(filled), has_paper(filled)
-    grouped = any(line.group for line in grid.lines)
-    head = [*([""] if grouped else []), "", *map(escape, (*grid.mark_names, *grid.headers))]
-    rows = [head, ["---"] * len(head)]
-    for line in grid.lines:
-        marks = ["yes" if mark else "no" for mark in line.marks]
-        marks += [""] * (len(grid.mark_names) - len(marks))
-        cells = [_cell(entry, paper) for entry in line.entries]
-        rows.append(
-            [*([escape(line.group)] if grouped else []), escape(line.label), *marks, *cells]
-        )
+    paper = has_paper(filled)
     said = say(filled)
     claims = [said.head, ["---"] * len(said.head), *said.lines] if said.lines else []
     paragraphs = [
@@ -36,7 +26,7 @@ def to_markdown(filled: Filled) -> str:
             [
                 f"# tab:{filled.table.label}",
                 escape(caption(filled)),
-                _table(rows),
+                *(_table(_rows(panel, paper)) for panel in in_panels(arrange(filled))),
                 *filter(None, paragraphs),
                 *notes,
                 "\n".join(map(escape, filled.provenance)),
@@ -44,6 +34,21 @@ def to_markdown(filled: Filled) -> str:
         )
         + "\n"
     )
+
+
+def _rows(grid: Grid, paper: bool) -> list[list[str]]:
+    """Header, rule and lines."""
+    grouped = any(line.group for line in grid.lines)
+    head = [*([""] if grouped else []), "", *map(escape, (*grid.mark_names, *grid.headers))]
+    rows = [head, ["---"] * len(head)]
+    for line in grid.lines:
+        marks = ["yes" if mark else "no" for mark in line.marks]
+        marks += [""] * (len(grid.mark_names) - len(marks))
+        cells = [_cell(entry, paper) for entry in line.entries]
+        rows.append(
+            [*([escape(line.group)] if grouped else []), escape(line.label), *marks, *cells]
+        )
+    return rows
 
 
 def to_csv(filled: Filled) -> str:
