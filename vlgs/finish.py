@@ -62,17 +62,19 @@ def report(
     evaluation = evaluate(field, scene, query, text, experiment.protocol, kept)
     asked = questions_of(field, scene, query, text)
     prompts = asked.prompts if asked else None
+    notes: dict[str, str] = {}
     if asked and asked.note:
         query = asked.query
-        evaluation = replace(evaluation, reasons={**evaluation.reasons, "words": asked.note})
+        notes["words"] = asked.note
     if len(progress.scenes) > 1 and field.has_language:
         first, *_, last = progress.scenes
-        whose = f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
-        evaluation = replace(evaluation, reasons={**evaluation.reasons, "pictures": whose})
+        notes["pictures"] = (
+            f"of the model of mask level {last}, as are frame rates; psnr and ssim of that of {first}"
+        )
     counted = isinstance(field, HasGaussians)
     if not counted:
-        none = {"n_gaussians": "the field is not made of Gaussians"}
-        evaluation = replace(evaluation, reasons={**evaluation.reasons, **none})
+        notes["n_gaussians"] = "the field is not made of Gaussians"
+    evaluation = replace(evaluation, reasons={**evaluation.reasons, **notes})
     cameras = [view.camera for view in scene.test or scene.train]
     timing = measure_fps(field, cameras, query, prompts, language)
     if experiment.pictures:

@@ -150,6 +150,7 @@ def require_scores(ran: Ran) -> None:
     clouds = list(ran.folder.path.rglob("point_cloud.ply"))
     assert bool(clouds) == isinstance(ran.field, HasGaussians)
     assert bool(ran.metrics["n_gaussians"]) == bool(clouds)
+    assert ("n_gaussians" in ran.metrics["reasons"]) == (ran.metrics["n_gaussians"] is None)
 
 
 def require_field(ran: Ran) -> None:

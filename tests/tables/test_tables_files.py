@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,8 +62,11 @@ def test_halves_of_characters_are_spelled_out_wherever_they_stand(table: Table, 
 def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
     write_lines(to_lines(read_metrics(tmp_path)), tmp_path)
-    (tmp_path / "categories.csv").unlink()
-    os.mkfifo(tmp_path / "categories.csv")
+    pipe = tmp_path / "categories.csv"
+    pipe.unlink()
+    os.mkfifo(pipe)
+    # Who waits for it is let go with nothing, and fails here.
+    threading.Thread(target=pipe.write_bytes, args=(b"",), daemon=True).start()
     with pytest.raises(ValueError, match=r"categories.csv: line 1 must be .* a folder or a device"):
         read_lines(tmp_path)
 
