@@ -72,6 +72,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
+    "gaussians.near_share": 0,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     "query.masks": None,
     "stages": None,

@@ -1,5 +1,6 @@
 """`conf` is the schema: it mirrors the constructors, and `--help` prints it."""
 
+import functools
 import inspect
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ def whole(path: Path) -> dict[str, Any]:
     return {key: value for key, value in (first | content).items() if key != "defaults"}
 
 
+@functools.cache
 def constructed() -> dict[str, set[str]]:
     """Target -> all keys that any file of conf gives it."""
     found: dict[str, set[str]] = {}

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from vlgs.gaussians.in_air import Air
+from vlgs.gaussians.in_air import Air, near_plane
 from vlgs.types import Camera, Scene, View
 
 NEAREST = 2.0
@@ -23,7 +23,7 @@ def camera(turn: float, x: float) -> Camera:
     )
 
 
-def air(points: list[list[float]]) -> Air:
+def scene(points: list[list[float]]) -> Scene:
     """Two cameras back to back: one unit apart, and no point before the second."""
     views = tuple(
         View(name, camera(turn, x), lambda: torch.zeros(16, 16, 3, dtype=torch.uint8))
@@ -32,7 +32,7 @@ def air(points: list[list[float]]) -> Air:
     given = torch.tensor(points)
     colors = torch.zeros(given.shape, dtype=torch.uint8)
     none = torch.zeros(0, 8), torch.zeros(0)
-    return Air(Scene("toy", views, (), "all", given, colors, *none))
+    return Scene("toy", views, (), "all", given, colors, *none)
 
 
 POINTS = [[0.0, 0.0, NEAREST], [1.0, 0.0, 3.0], [9.0, 0.0, 0.5], [math.nan, 0.0, 1.0]]
@@ -49,9 +49,31 @@ POINTS = [[0.0, 0.0, NEAREST], [1.0, 0.0, 3.0], [9.0, 0.0, 0.5], [math.nan, 0.0,
     ],
 )
 def test_what_is_in_the_air(mean: tuple[float, float, float], inside: bool):
-    assert air(POINTS)(torch.tensor([mean])).tolist() == [inside]
+    assert Air(scene(POINTS))(torch.tensor([mean])).tolist() == [inside]
 
 
 def test_nothing_is_in_the_air_without_points():
     means = torch.tensor([[0.0, 0.0, 0.1], [0.3, 0.0, 5.0]])
-    assert not air([[math.nan] * 3])(means).any()
+    assert not Air(scene([[math.nan] * 3]))(means).any()
+
+
+@pytest.mark.parametrize(
+    ("depths", "near"),
+    [
+        ([2.0, 3.0, 4.0, 5.0], 2.0),  # half of the third: two may be stray
+        ([5.0, 4.0, 3.0, 2.0], 2.0),
+        ([0.1, 0.2, 4.0], 2.0),
+        ([3.0, 1.0], 1.5),
+        ([-1.0], 0.0),  # behind the camera
+        ([1e13, 1e13, 1e13], 0.0),  # as broken as a NaN
+    ],
+)
+def test_the_near_plane_is_a_share_of_the_nearest_points_depth(depths: list[float], near: float):
+    beside = [[0.9 * z, 0.0, z] for z in depths]  # at the image's edge: depth, not distance
+    assert near_plane(scene([*beside, [math.nan] * 3]), 0.5) == pytest.approx(near)
+
+
+def test_the_camera_that_comes_nearest_says_where_it_is():
+    behind = [[1.0, 0.0, -z] for z in (0.5, 0.6, 0.8)]  # seen by the second camera alone
+    before = [[0.0, 0.0, z] for z in (2.0, 3.0, 4.0)]
+    assert near_plane(scene([*behind, *before]), 0.5) == pytest.approx(0.4)

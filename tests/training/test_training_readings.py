@@ -8,6 +8,8 @@ import torch
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
+from vlgs.fields.saved import plan_of_model
+from vlgs.gaussians.in_air import near_plane
 from vlgs.geometry import camera_center
 from vlgs.training.build import Parts, build_module
 from vlgs.training.callbacks import ClearAir
@@ -111,6 +113,18 @@ def test_codes_and_indicators_slow_down_along_half_a_cosine(tiny_scene: Scene):
     assert rates["opacity_logits"] == 5e-2
     with pytest.raises(ValueError, match="language_decay must be"):
         TrainerConfig(1000, LearningRates(), language_decay=1.5)
+
+
+def test_nothing_is_drawn_nearer_than_a_share_of_what_cameras_see(tiny_scene: Scene):
+    near = near_plane(tiny_scene, 0.5)
+    assert near > 0.1
+    module = module_of(tiny_scene, "gaussians.near_share=0.5")
+    assert module.model.raster.near == near
+    assert (
+        plan_of_model(module.model, True, True)["raster"]["near"] == near
+    )  # what a folder is read by
+    assert module_of(tiny_scene, "gaussians.near_share=0.0").model.raster.near == 0.01
+    assert module_of(tiny_scene, "gaussians.near_share=1e-4").model.raster.near == 0.01
 
 
 def test_air_is_cleared_in_the_end_of_what_colour_cannot_see(tiny_scene: Scene):

@@ -119,6 +119,9 @@ class GaussiansConfig:
     (`vlgs.training.silence`); 1: none is."""
     clear_air: bool = False
     """Whether Gaussians that only language sees, before a camera, are removed in the end (`vlgs.gaussians.in_air`)."""
+    near_share: float = 0.0
+    """Nothing is drawn nearer to a camera than this share of the depth at which the nearest sparse point stands before any training camera
+    (`vlgs.gaussians.in_air.near_plane`), nor nearer than `RasterConfig.near`; 0: that alone."""
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
@@ -155,7 +158,7 @@ class GaussiansConfig:
         require_range("gaussians", 1, 10**7, init_points=self.init_points)
         require_range("gaussians", 1, 10**9, max_count=self.max_count)
         require_range("gaussians", 0, 10**6, background=self.background)
-        require_range("gaussians", 0, 1, silent_above=self.silent_above)
+        require_range("gaussians", 0, 1, silent_above=self.silent_above, near_share=self.near_share)
         require_range("gaussians", 1, 65536, codes_kept=self.codes_kept)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
         for name, options in {

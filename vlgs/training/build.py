@@ -15,6 +15,7 @@ from vlgs.fusion import Fusion
 from vlgs.fusion.none import NoFusion
 from vlgs.gaussians import GaussiansConfig, Sharing, attributes_of, conform, initialise
 from vlgs.gaussians.background import with_background
+from vlgs.gaussians.in_air import near_plane
 from vlgs.gaussians.init import seeded_generator
 from vlgs.gaussians.sh import SH_C0
 from vlgs.heads import FittedHead, Head
@@ -117,12 +118,13 @@ def build_module(
     else:
         first = initialise(scene, config, attributes, seed)
         parameters = with_background(first, scene, config.background, attributes)
+    near = near_plane(scene, config.near_share) if config.near_share else 0.0
     model = SplatModel(
         parameters,
         fusion,
         parts.indicator,
         head,
-        parts.raster,
+        replace(parts.raster, near=max(near, parts.raster.near)),
         sh_degree=0,
         evaluated=config.color == "evaluated",
         attributes=attributes,
