@@ -4,6 +4,7 @@ import functools
 import gc
 import importlib
 import os
+import pickle
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,18 +47,18 @@ def files_of_options_parsed_once() -> Iterator[None]:
     """Hydra composes hundreds of configurations of the same files; what it is given of each is made anew."""
     from omegaconf import DictConfig, OmegaConf
 
-    load, kept = OmegaConf.load, dict[str, Any]()
+    load, kept = OmegaConf.load, dict[str, bytes]()
 
     def load_once(file: str | Path | IO[str]) -> Any:
         if isinstance(file, str | Path):
             return load(file)
         text = file.read()
         if text in kept:
-            return OmegaConf.create(kept[text])
+            return pickle.loads(kept[text])  # a ninth of the time of `OmegaConf.create`
         file.seek(0)
         made = load(file)
         if isinstance(made, DictConfig):
-            kept[text] = OmegaConf.to_container(made)
+            kept[text] = pickle.dumps(made)
         return made
 
     with pytest.MonkeyPatch.context() as patch:

@@ -193,7 +193,9 @@ class SplatModel(nn.Module):
 
     def predict(self, feature: Float[Tensor, "h w c"]) -> Float[Tensor, "h wl t"]:
         """What a rendered map of codes is compared by (`Head.predict`); l mask levels stand beside each other in a row."""
-        return self.head.predict(feature.view(len(feature), -1, self.head.dim))
+        if feature.shape[-1] != self.head.dim:
+            feature = feature.view(len(feature), -1, self.head.dim)
+        return self.head.predict(feature)
 
     def view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
         """RGB of every Gaussian as a camera sees it, >= 0."""
