@@ -18,7 +18,9 @@ from vlgs.geometry import camera_center
 from vlgs.types import Camera, Scene
 
 STRAY_POINTS = 2
-"""So many of the points that a camera sees may be errors of measurement; the next one counts as the nearest."""
+"""So many of the points that a camera sees may be errors of measurement, though no more than one in a hundred; the next one counts as the nearest."""
+FEWEST_POINTS = 100
+"""Fewer points in all do not tell where a scene begins."""
 
 
 class Air:
@@ -45,15 +47,16 @@ class Air:
 
 
 def near_plane(scene: Scene, share: float) -> float:
-    """Depth before which nothing is drawn: a share of that of the nearest thing that any training camera sees, by sparse points; 0 without points.
+    """Depth before which nothing is drawn: a share of that of the nearest thing that any training camera sees, by sparse points.
 
-    Example:
-        A camera that sees points 2, 3, 4 and 5 units deep, and a share of one half: 2 units, half the depth of the third.
+    It is 0 where there are too few points. What stands before a camera without one sparse point on it, nearer than this, is not drawn either.
     """
     points = scene.points.float()
     points = points[(points.abs() <= MAX_COORDINATE).all(dim=1)]
+    if len(points) < FEWEST_POINTS:
+        return 0.0
     depths = [_depths(points, view.camera) for view in scene.train]
-    nearest = [seen[min(STRAY_POINTS, len(seen) - 1)] for seen in depths if len(seen)]
+    nearest = [seen[min(STRAY_POINTS, len(seen) // 100)] for seen in depths if len(seen)]
     return share * float(torch.stack(nearest).amin()) if nearest else 0.0
 
 
