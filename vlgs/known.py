@@ -152,6 +152,7 @@ def unread(config: Mapping[str, Any], name: str = "config") -> Iterator[tuple[st
             yield from _unread_in(str(key), value)
 
 
+@cache
 def former(key: str) -> str:
     """What a key was called before, or itself.
 
