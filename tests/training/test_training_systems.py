@@ -61,6 +61,34 @@ def module_of(method: str, scene: Scene, *overrides: str) -> VLGSModule:
     return build_module(scene, parts, 0)
 
 
+@pytest.mark.parametrize("method", ["best", "goi", "langsplat", "langsplat_v2", "lift"])
+def test_without_masks_what_colour_made_stays_as_it_is(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+):
+    done: list[int] = []
+    step_of = VLGSModule.training_step
+
+    def stepping(self: VLGSModule, step: int, batch_idx: int) -> None:
+        done.append(self.next_step)
+        step_of(self, step, batch_idx)
+
+    monkeypatch.setattr(VLGSModule, "training_step", stepping)
+    silent = without_language(tiny_scene)
+    progress, workshop = made(method, silent, tmp_path, "trainer.iterations=4")
+    assert done == [0, 1, 2, 3]
+    field = progress.field()
+    assert isinstance(field, SplatField)
+    assert not field.has_language
+    geometry = workshop.made["geometry"].field
+    assert isinstance(geometry, SplatField)
+    for name in ("means", "quats", "log_scales", "sh0", "shN", "opacity_logits"):
+        assert torch.equal(field.model.splats[name], geometry.model.splats[name]), name
+    assert field.model.sh_degree == geometry.model.sh_degree
+    again, _ = made(method, silent, tmp_path, "trainer.iterations=4")
+    assert len(done) == 4, "what is made is read back"
+    assert torch.equal(again.field().model.splats["sh0"], field.model.splats["sh0"])  # type: ignore[attr-defined]
+
+
 def test_3dgs_learns_from_colour_alone(tiny_scene: Scene, tmp_path: Path):
     progress, _ = made("gs3d", tiny_scene, tmp_path, "trainer.iterations=4", QUICK)
     field = progress.field()

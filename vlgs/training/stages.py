@@ -221,7 +221,10 @@ class Train:
         for level, scene in progress.scenes.items():
             start = None if self.start is None else progress.gaussians(self.start, level)
             folder = progress.folder(level, self.name)
-            models[level] = workshop.train(folder, scene, self._change, start, self.color)
+            if start is not None and not self.color and not len(scene.mask_vectors):
+                models[level] = workshop.lift(folder, scene, start)
+            else:
+                models[level] = workshop.train(folder, scene, self._change, start, self.color)
         return progress.having(self.name, models)
 
     def _change(self, parts: Parts) -> Parts:
@@ -282,15 +285,13 @@ class Lift:
     """From masks to a code; None: the mean of codes (`vlgs.training.lift`)."""
 
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
-        """See `Stage`. A mask level without a single mask has nothing to be lifted, and is trained on colour."""
+        """See `Stage`. A mask level without a single mask has nothing to be lifted: its Gaussians stay as they are."""
         models = {}
         for level, scene in progress.scenes.items():
             folder = progress.folder(level, self.name)
-            if len(scene.mask_vectors):
-                start = progress.gaussians(self.start, level)
-                models[level] = workshop.lift(folder, scene, start, self.lift)
-            else:
-                models[level] = workshop.train(folder, scene)
+            start = progress.gaussians(self.start, level)
+            rule = self.lift if len(scene.mask_vectors) else None
+            models[level] = workshop.lift(folder, scene, start, rule)
         return progress.having(self.name, models)
 
 

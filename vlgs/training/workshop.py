@@ -128,6 +128,8 @@ class Workshop:
     ) -> SplatField:
         """Lift the language of a scene onto finished Gaussians, or read it back; the folder is as that of a trained model.
 
+        Where the scene has no masks the Gaussians stay as they are.
+
         Args:
             name: Sub-folder; empty for the folder of the run itself.
             scene: Whose masks count.
