@@ -5,7 +5,7 @@ them. Language does, as its weight is another: over large areas codes are consta
 from between those it hides the scene. A few dozen of them cost a room 3 to 5 points of mIoU.
 
 Others stand where a camera that nobody trained on will be: a few pixels wide from the training cameras behind it, they fill its image. In a
-street drive whose middle tenth is held out, what is less than 0.1 units before the camera (the nearest sparse points: 0.8) covers 58 % of one view.
+street drive whose middle tenth is held out, what is less than 0.3 units before the camera (the nearest sparse points: 0.8) covers 58 % of one view.
 No rule can tell them from things seen from afar before the camera is there, hence the near plane.
 """
 
