@@ -53,7 +53,7 @@ def near_plane(scene: Scene, share: float) -> float:
     """
     points = scene.points.float()
     points = points[(points.abs() <= MAX_COORDINATE).all(dim=1)]
-    if len(points) < FEWEST_POINTS:
+    if share == 0 or len(points) < FEWEST_POINTS:
         return 0.0
     depths = [_depths(points, view.camera) for view in scene.train]
     nearest = [seen[min(STRAY_POINTS, len(seen) // 100)] for seen in depths if len(seen)]

@@ -118,13 +118,13 @@ def build_module(
     else:
         first = initialise(scene, config, attributes, seed)
         parameters = with_background(first, scene, config.background, attributes)
-    near = near_plane(scene, config.near_share) if config.near_share else 0.0
+    near = max(parts.raster.near, near_plane(scene, config.near_share))
     model = SplatModel(
         parameters,
         fusion,
         parts.indicator,
         head,
-        replace(parts.raster, near=max(near, parts.raster.near)),
+        replace(parts.raster, near=near),
         sh_degree=0,
         evaluated=config.color == "evaluated",
         attributes=attributes,

@@ -290,8 +290,7 @@ class Lift:
         for level, scene in progress.scenes.items():
             folder = progress.folder(level, self.name)
             start = progress.gaussians(self.start, level)
-            rule = self.lift if len(scene.mask_vectors) else None
-            models[level] = workshop.lift(folder, scene, start, rule)
+            models[level] = workshop.lift(folder, scene, start, self.lift)
         return progress.having(self.name, models)
 
 

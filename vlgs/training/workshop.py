@@ -145,7 +145,8 @@ class Workshop:
         module.model.sh_degree = start.sh_degree
         # Rules differentiate by what they blend, and by nothing else.
         module.model.requires_grad_(False)
-        lift_features(module) if rule is None else lift_by(rule, module)
+        if len(scene.mask_vectors):
+            lift_features(module) if rule is None else lift_by(rule, module)
         module.next_step = module.settings.iterations
         module.train_seconds = time.perf_counter() - started
         folder.require_own()
