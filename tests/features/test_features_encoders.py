@@ -133,6 +133,7 @@ def test_missing_weights_say_what_to_download_and_where(tmp_path: Path):
 
 
 def test_weights_that_are_no_model_are_refused(tmp_path: Path):
+    pytest.importorskip("transformers")
     folder = tmp_path / "model"
     folder.mkdir()
     settings = '{"image_mean": [0,0,0], "image_std": [1,1,1], "size": 4}'
@@ -141,4 +142,11 @@ def test_weights_that_are_no_model_are_refused(tmp_path: Path):
     (folder / "model.safetensors").write_bytes(b"nothing")
     encoder = ImageEncoder(Pretrained(name="lab/model", weights=str(tmp_path)))
     with pytest.raises(ValueError, match="files must be a whole model of lab/model"):
+        encoder(noise(), [Mask(0, 0, np.ones((1, 1), bool))], "a")
+
+
+def test_a_missing_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr("vlgs.extras.find_spec", lambda _: None)
+    encoder = ImageEncoder(Pretrained(name="lab/model", weights=str(tmp_path)))
+    with pytest.raises(ValueError, match=r"transformers: must be installed.*vlgs\[features\]"):
         encoder(noise(), [Mask(0, 0, np.ones((1, 1), bool))], "a")

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from vlgs.data.untrusted.arrays import map_npy
+from vlgs.extras import require_extra
 from vlgs.features.masks import Mask
 from vlgs.features.weights import Pretrained
 
@@ -78,6 +79,7 @@ class ImageEncoder:
     def _model(self) -> tuple[Any, int, Tensor, Tensor]:
         """The model, the side of its input, and mean and standard deviation of its pixels."""
         if self._loaded is None:
+            require_extra("transformers", "features")
             from transformers import AutoModel
 
             settings = self.pretrained.preprocessing()

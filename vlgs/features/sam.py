@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
+from vlgs.extras import require_extra
 from vlgs.features.masks import Mask, crop_mask, remove_small_regions
 from vlgs.features.nms import MaskNms, box_nms
 from vlgs.features.weights import Pretrained
@@ -209,6 +210,7 @@ class SamSegmenter:
     def _model(self) -> tuple[Any, Tensor, Tensor]:
         """The model, and mean and standard deviation of its pixels."""
         if self._loaded is None:
+            require_extra("transformers", "features")
             from transformers import SamModel  # 2.6 s, and an optional dependency
 
             model = self.pretrained.load(SamModel)

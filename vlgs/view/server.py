@@ -5,9 +5,9 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import rich
-import viser  # pyright: ignore[reportMissingImports]
 from PIL import Image
 
 from vlgs.names import file_names
@@ -20,6 +20,9 @@ from vlgs.view.session import Frame, Session, describe
 from vlgs.view.shown import Shown
 from vlgs.view.wish import ASKING, LAYOUTS, OUTPUTS, Wish
 from vlgs.view.worker import Stage, Worker
+
+if TYPE_CHECKING:
+    import viser  # pyright: ignore[reportMissingImports]
 
 _QUALITY = {Stage.COARSE: 75, Stage.SHARP: 92, Stage.EXACT: 92}
 """Of JPEG."""
@@ -47,6 +50,8 @@ class Server:
     """
 
     def __init__(self, runs: list[Shown], address: Address, word: str | None = None) -> None:
+        import viser  # an optional package; the command says which extra brings it
+
         require_free(address)
         self.runs = runs
         self.word = word
@@ -84,14 +89,14 @@ class Server:
             _three(self.around.up_of(camera)),
         )
 
-    async def _connected(self, client: viser.ClientHandle) -> None:
+    async def _connected(self, client: "viser.ClientHandle") -> None:
         # In the loop of events, so that a browser's events come one after the other.
         panel = _Panel(client, self.runs, self.worker, self.cameras, self.around)
         panel.begin()
         if self.word is not None:
             panel.ask(self.word)
 
-    async def _disconnected(self, client: viser.ClientHandle) -> None:
+    async def _disconnected(self, client: "viser.ClientHandle") -> None:
         self.worker.close(client.client_id)
 
 
@@ -100,7 +105,7 @@ class _Panel:
 
     def __init__(
         self,
-        client: viser.ClientHandle,
+        client: "viser.ClientHandle",
         runs: list[Shown],
         worker: Worker,
         cameras: Sequence[NamedCamera],
@@ -122,7 +127,7 @@ class _Panel:
         """Draw the first picture, and one for every movement."""
         self.worker.open(self.client.client_id, self.session)
 
-        async def moved(camera: viser.CameraHandle) -> None:
+        async def moved(camera: "viser.CameraHandle") -> None:
             self._wish(moving=True, eye=_eye_of(camera))
 
         self.client.camera.on_update(moved)
@@ -271,7 +276,7 @@ class _Panel:
         self.client.send_file_download(safe, content, save_immediately=True)
 
 
-def _eye_of(camera: viser.CameraHandle) -> Eye:
+def _eye_of(camera: "viser.CameraHandle") -> Eye:
     w, h = max(int(camera.image_width), 1), max(int(camera.image_height), 1)
     scale = min(_LARGEST / max(w, h), 1.0)
     return Eye(
