@@ -11,6 +11,7 @@ from vlgs.bench.presets import composed
 from vlgs.bench.record import read_record
 from vlgs.identity import RESULTS_VERSION
 from vlgs.skips import SKIPS
+from vlgs.training.after_step import TrainedModule
 
 
 def test_every_recipe_is_a_configuration_of_its_own():
@@ -113,3 +114,30 @@ def test_the_last_iteration_is_evaluated():
     for iterations in (1, 7, 1500):
         assert max(evaluated_at(iterations, 8)) == iterations
         assert min(evaluated_at(iterations, 8)) >= 1
+
+
+def test_a_training_that_was_stopped_goes_on_with_its_clocks_and_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scenes = {"large": (*train.QUICK, "trainer.iterations=9", "trainer.checkpoint_every=4")}
+    evaluate, stopped_at = curve.Curve.evaluate, []
+
+    def killed(self: curve.Curve, module: TrainedModule) -> None:
+        if module.next_step == stopped_at[-1]:
+            raise RuntimeError("killed")
+        evaluate(self, module)
+
+    monkeypatch.setattr(curve.Curve, "evaluate", killed)
+    for stop in (5, 9):  # after a checkpoint; then after the last, before its evaluation
+        stopped_at.append(stop)
+        with pytest.raises(RuntimeError, match="killed"):
+            train.run_train(scenes, ["neither"], tmp_path, 3, 1, [0])
+    monkeypatch.setattr(curve.Curve, "evaluate", evaluate)
+    rows = train.run_train(scenes, ["neither"], tmp_path, 3, 1, [0])
+    assert rows[0].scene == "glassware_large"
+    (file,) = (tmp_path / "train").iterdir()
+    table = read_record(file)
+    assert list(table.iteration) == [1, 4, 9]
+    assert table.seconds.is_monotonic_increasing
+    whole = train.run_train(scenes, ["neither"], tmp_path / "whole", 3, 1, [0])
+    assert (rows[0].psnr, rows[0].miou) == (whole[0].psnr, whole[0].miou)

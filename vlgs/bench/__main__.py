@@ -105,6 +105,9 @@ def train(parser: ArgumentParser) -> Runner:
         help="of the photographs, e.g. data.features=FOLDER query=vocab_softmax",
     )  # fmt: skip
     parser.add_argument("--no-synthetic", action="store_true", help="the photographs alone")
+    parser.add_argument(
+        "--large", action="store_true", help="the procedural scene with 300 views of 986x728"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", help="of the training; default: --seed")
     parser.add_argument("--points", type=int, default=8, help="evaluations per curve")
     parser.add_argument("--train-threads", type=int, default=2)
@@ -119,7 +122,7 @@ def train(parser: ArgumentParser) -> Runner:
         if unknown:
             raise ValueError(f"bench: recipe must be one of {', '.join(RECIPES)}, got {unknown[0]}")
         scenes = scene_overrides(
-            args.root, args.resize, args.quick, not args.no_synthetic, args.override
+            args.root, args.resize, args.quick, not args.no_synthetic, args.override, args.large
         )
         points = 2 if args.quick else args.points
         targets = (args.psnr, args.miou)

@@ -1,7 +1,8 @@
 """A learning curve: scores on held-out views after so many seconds of training, evaluation not counted."""
 
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,7 @@ import lightning as L  # noqa: N812 (its own abbreviation)
 from vlgs.bench.presets import Trained
 from vlgs.bench.quality import score
 from vlgs.fields.trained import SplatField
-from vlgs.training.after_step import AfterStep, TrainedModule
-from vlgs.training.lightning import VLGSModule
+from vlgs.training.after_step import AfterStep, TrainedModule, own
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,31 @@ class CurvePoint:
 
 
 class Curve(AfterStep):
-    """Evaluates after chosen iterations. Must come last, so that what other callbacks do is counted."""
+    """Evaluates after chosen iterations. Must come last, so that what other callbacks do is counted.
 
-    def __init__(self, trained: Trained, label: str, at: frozenset[int]) -> None:
+    `meta` goes into every checkpoint, so that a training that was stopped goes on with its clocks and points. A checkpoint is
+    written before its own iteration is counted and evaluated: what is missing of it then is evaluated when the training goes on.
+    """
+
+    def __init__(self, trained: Trained, scene: str, label: str, at: frozenset[int]) -> None:
         self.trained = trained
+        self.scene = scene
         self.label = label
         self.at = at
         self.points: list[CurvePoint] = []
         self.wall = self.cpu = 0.0
         self.started = (0.0, 0.0)
+        self.meta: dict[str, Any] = {}
+
+    def resume(self, meta: Mapping[str, Any]) -> None:
+        """Go on from what a checkpoint says."""
+        self.wall, self.cpu = meta["wall"], meta["cpu"]
+        self.points = [CurvePoint(**point) for point in meta["points"]]
+        self.meta.update(meta)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Evaluate what a stop came before."""
+        self.evaluate(own(pl_module))
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
@@ -51,20 +67,24 @@ class Curve(AfterStep):
 
     def after_step(self, module: TrainedModule) -> None:
         """Stop the clocks, then evaluate if it is time."""
-        assert isinstance(module, VLGSModule)
         self.wall += time.perf_counter() - self.started[0]
         self.cpu += time.process_time() - self.started[1]
-        if module.next_step not in self.at:
+        self.evaluate(module)
+        points = [asdict(point) for point in self.points]
+        self.meta.update(wall=self.wall, cpu=self.cpu, points=points)
+
+    def evaluate(self, module: TrainedModule) -> None:
+        """Add a point if this iteration has one and it is not there."""
+        step = module.next_step
+        if step not in self.at or (self.points and self.points[-1].iteration == step):
             return
         scores = score(
-            self.trained.experiment,
-            self.trained.scene,
-            SplatField(self.trained.module.model),
+            self.trained.experiment, self.trained.scene, SplatField(self.trained.module.model)
         )
         self.points.append(
             CurvePoint(
-                self.trained.scene.name, self.label, module.next_step, self.wall, self.cpu,
-                scores.psnr, scores.miou, module.model.count,
+                self.scene, self.label, step, self.wall, self.cpu,
+                scores.psnr, scores.miou, module.count,
             )
         )  # fmt: skip
 

@@ -39,15 +39,16 @@ def _measure(path: Path, config: RasterConfig, threads: int) -> Memory:
     w = load_workload(path)
     before = _resident()
     time_render(w, config, threads)
-    peak = _peak()
+    peak = peak_bytes()
     return Memory(peak / MIB, (peak - before) / MIB)
 
 
 def _resident() -> int:
-    return _status("VmRSS") or _peak()
+    return _status("VmRSS") or peak_bytes()
 
 
-def _peak() -> int:
+def peak_bytes() -> int:
+    """The most memory that this process has held."""
     # getrusage's figure survives fork and exec, so that it may be the parent's: Linux knows better.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return _status("VmHWM") or (peak if sys.platform == "darwin" else 1024 * peak)

@@ -1,6 +1,6 @@
 """Time to reach a score: one learning curve per preset and schedule, on a procedural and a real scene."""
 
-import tempfile
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -11,6 +11,7 @@ import pandas as pd
 import torch
 
 from vlgs.bench.curve import Curve, CurvePoint, curve_path, evaluated_at, seconds_to
+from vlgs.bench.memory import peak_bytes
 from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.record import (
     COLORS,
@@ -27,6 +28,7 @@ from vlgs.experiment import construct
 from vlgs.identity import RESULTS_VERSION
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS, turn
+from vlgs.training.checkpoint import load_checkpoint
 from vlgs.training.fit import FitOptions, fit
 from vlgs.training.settings import LearningRates
 
@@ -70,6 +72,8 @@ RECIPES: dict[str, tuple[str, ...]] = {
     "all skips": _skips(on=True),
     "no skips": _skips(on=False),
     "short": ("trainer.iterations=500", "trainer.sh_every=100", "gaussians.densify.start=100", "gaussians.densify.stop=350"),
+    "paper": ("trainer=paper",),
+    "paper, half size": ("trainer=paper", "trainer.half_size=0.5"),
     "photos": ("trainer=photos",),
     "fast photos": ("trainer=fast_photos",),
 }  # fmt: skip
@@ -77,6 +81,8 @@ RECIPES: dict[str, tuple[str, ...]] = {
 
 QUICK = ("data.width=48", "data.height=36", "data.train_views=6", "data.test_views=2", "data.points=400",
          "head.training.steps=30", "trainer=smoke")  # fmt: skip
+LARGE = ("data.width=986", "data.height=728", "data.train_views=300", "data.points=40000")
+"""The procedural scene with the photographs of a scene of LERF: as many, and as large."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,7 @@ def scene_overrides(
     quick: bool,
     synthetic: bool = True,
     further: Sequence[str] = (),
+    large: bool = False,
 ) -> dict[str, tuple[str, ...]]:
     """What `python -m vlgs.run` is told of each scene: the procedural one, and the photographs at `root` where one is given.
 
@@ -118,13 +125,14 @@ def scene_overrides(
         quick: Small and short.
         synthetic: Whether the procedural scene is among them.
         further: Overrides for the photographs: where their language maps are, how they are asked.
+        large: Whether the procedural scene is as large as one of LERF.
 
     Raises:
         ValueError: If there is no scene, or overrides for photographs that are not there.
     """
     scenes: dict[str, tuple[str, ...]] = {}
     if synthetic:
-        scenes["synthetic"] = QUICK if quick else ()
+        scenes["large" if large else "synthetic"] = QUICK if quick else LARGE if large else ()
     if root is not None:
         photographs = ("data=colmap", f"data.root={root}", f"data.resize={resize}", *further)
         scenes["photographs"] = (*photographs, *(QUICK[-1:] if quick else ()))
@@ -160,9 +168,10 @@ def run_train(
     path, rows = out / "train.csv", []
     for seed in seeds:
         found = {}
-        for extra in scenes.values():
+        for kind, extra in scenes.items():
             for label in labels:
-                curve = _curve(label, (*extra, *RECIPES[label]), out, points, threads, seed)
+                overrides = (*extra, *RECIPES[label])
+                curve = _curve(kind, label, overrides, out, points, threads, seed)
                 found[str(curve.scene.iloc[0]), label] = curve
         rows += _summaries(found, targets, seed)
         write_record(path, _beside(path, rows), header)
@@ -195,26 +204,40 @@ def _beside(path: Path, rows: Sequence[Summary]) -> list[Summary]:
 
 
 def _curve(
-    label: str, overrides: Sequence[str], out: Path, points: int, threads: int, seed: int
+    kind: str,
+    label: str,
+    overrides: Sequence[str],
+    out: Path,
+    points: int,
+    threads: int,
+    seed: int,
 ) -> pd.DataFrame:
     given = [*BASE, *overrides, f"seed={seed}", f"threads={threads}", "progress=false"]
     experiment = construct(composed(given))
     iterations = experiment.parts.trainer.iterations
     torch.set_num_threads(threads)
     scene = experiment.read_scene()
-    path = curve_path(out / "train", scene.name, experiment.run_id(scene.fingerprint))
+    name = f"{scene.name}_large" if kind == "large" else scene.name
+    path = curve_path(out / "train", name, experiment.run_id(scene.fingerprint))
     if path.is_file():
-        say(f"{scene.name}, {label}: {path} is there")
+        say(f"{name}, {label}: {path} is there")
         return read_record(path).assign(label=label)
-    say(f"{scene.name}, {label}: {iterations} iterations ...")
+    say(f"{name}, {label}: {iterations} iterations ...")
     header = provenance(seed, overrides=" ".join(overrides), training_threads=threads)
     trained = Trained(experiment, scene, build(experiment, scene))
-    curve = Curve(trained, label, evaluated_at(iterations, points))
-    with tempfile.TemporaryDirectory() as folder:
-        options = FitOptions(meta={}, progress=False, callbacks=[curve])
-        if fit(trained.module, RunFolder(Path(folder)), options) is not None:
+    curve = Curve(trained, name, label, evaluated_at(iterations, points))
+    with RunFolder(path.with_suffix("")).writing() as folder:
+        checkpoint = load_checkpoint(folder.checkpoint)
+        if checkpoint is not None:
+            curve.resume(checkpoint.meta)
+        if fit(trained.module, folder, FitOptions(curve.meta, False, callbacks=[curve])):
             raise KeyboardInterrupt
-    write_record(path, curve.points, header)
+        curve.evaluate(trained.module)
+        peak = (
+            f"{peak_bytes() / 2**30:.2f} GiB of memory, scene and what was trained before included"
+        )
+        write_record(path, curve.points, {**header, "peak": peak})
+    shutil.rmtree(folder.path)
     return _frame(curve.points)
 
 
