@@ -67,6 +67,31 @@ def files_of_options_parsed_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def groups_of_options_joined_once() -> Iterator[None]:
+    """More than half of the time that Hydra takes for a configuration goes into joining the files of its groups, mostly the same ones."""
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+
+    from vlgs.config import CONF
+
+    join, kept = ConfigLoaderImpl._compose_config_from_defaults_list, dict[str, bytes]()
+
+    def join_once(self: ConfigLoaderImpl, defaults: Any, repo: Any) -> Any:
+        folders = {
+            Path(source.path) for source in repo.get_sources() if Path(source.path).is_absolute()
+        }
+        if folders != {CONF}:
+            return join(self, defaults, repo)  # a test's own files, which it may write anew
+        key = repr(defaults)
+        if key not in kept:
+            kept[key] = pickle.dumps(join(self, defaults, repo))
+        return pickle.loads(kept[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", join_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def rows_of_tables_composed_once() -> Iterator[None]:
     """The tests ask for a few dozen rows hundreds of times, and Hydra takes a tenth of a second for each."""
     from vlgs.tables import benchmark

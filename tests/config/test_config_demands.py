@@ -56,12 +56,12 @@ def test_check_says_what_run_says_beside_the_faults_of_the_scene():
 def test_a_part_of_a_plugin_is_refused_until_it_says_that_it_fits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "my_lab.py").write_text(GATED)
+    (tmp_path / "my_parts.py").write_text(GATED)
     monkeypatch.syspath_prepend(str(tmp_path))
     apart = ("sharing=none", "fusion=none")
-    with pytest.raises(ValueError, match=r"fusion must be none with .*, got my_lab\.Gated"):
-        construct(composed(*apart, "fusion._target_=my_lab.Gated"))
-    construct(composed(*apart, "fusion._target_=my_lab.Apart"))
+    with pytest.raises(ValueError, match=r"fusion must be none with .*, got my_parts\.Gated"):
+        construct(composed(*apart, "fusion._target_=my_parts.Gated"))
+    construct(composed(*apart, "fusion._target_=my_parts.Apart"))
 
 
 def test_what_says_nothing_has_no_property():
