@@ -5,7 +5,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -13,12 +13,14 @@ from typing import BinaryIO
 _TEMPORARY = re.compile(r"\..+\.\d+(-[0-9a-f]{8})?\.tmp")
 
 
-def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
+def write_atomically(
+    path: Path, data: bytes | Callable[[BinaryIO], object], durable: bool = True
+) -> None:
     """Replace a file by `data`, or leave it as it was; a reader sees the old file or the whole new one.
 
     Args:
         path: The file; its folder must exist.
-        data: Its content.
+        data: Its content, or what writes it, where it is too large to be held.
         durable: Whether to wait until the disk has it, so that it survives a power cut too and not only a killed process.
 
     Raises:
@@ -28,12 +30,15 @@ def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
     with _open_temporary(path) as file:
         temporary = Path(file.name)
         try:
-            file.write(data)
+            if callable(data):
+                data(file)
+            else:
+                file.write(data)
             file.flush()
             if durable:
                 os.fsync(file.fileno())
             temporary.replace(path)
-        except OSError:
+        except BaseException:
             with suppress(OSError):
                 temporary.unlink()
             raise

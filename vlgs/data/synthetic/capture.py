@@ -1,11 +1,12 @@
 """All photographs of a scene, and the exact masks in them. They are rendered once."""
 
 import functools
-import io
 import logging
-from collections.abc import Collection
+import zipfile
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Int
@@ -115,12 +116,25 @@ def _photographs(
     except (OSError, ValueError) as error:
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
     photos = _taken(world, cameras, settings)
-    content = io.BytesIO()
-    stacks = {name: np.stack([getattr(photo, name) for photo in photos]) for name in names}
-    np.savez(content, **stacks)  # pyright: ignore[reportArgumentType] (names are not allow_pickle)
     cache.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, content.getvalue())
+    write_atomically(file, functools.partial(_write, photos))
     return photos
+
+
+def _write(photos: Sequence[TracedImage], file: BinaryIO) -> None:
+    """As `numpy.savez` of one stack per field, without ever holding one: hundreds of large photographs are gigabytes."""
+    with zipfile.ZipFile(file, "w") as archive:
+        for field in fields(TracedImage):
+            arrays = [getattr(photo, field.name) for photo in photos]
+            header = {
+                "descr": np.lib.format.dtype_to_descr(arrays[0].dtype),
+                "fortran_order": False,
+                "shape": (len(arrays), *arrays[0].shape),
+            }
+            with archive.open(f"{field.name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, header)
+                for array in arrays:
+                    member.write(array.tobytes())
 
 
 def _taken(world: World, cameras: list[Camera], settings: SceneSettings) -> list[TracedImage]:
