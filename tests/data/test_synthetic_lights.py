@@ -133,7 +133,7 @@ def test_training_photographs_have_gains_and_held_out_ones_have_none(tmp_path: P
     for seed in (0, 1):
         cache = str(tmp_path / "cache")
         plain, bright = images(even, seed), images(uneven, seed, cache)
-        capture._open.cache_clear()
+        capture._kept.cache_clear()
         again = images(uneven, seed, cache)
         assert all(torch.equal(a, b) for a, b in zip(bright, again, strict=True))
         assert all(torch.equal(a, b) for a, b in zip(bright[6:], plain[6:], strict=True))

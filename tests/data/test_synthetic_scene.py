@@ -83,7 +83,7 @@ def test_every_scene_loads(name, difficulty):
 
 def test_the_same_arguments_give_the_same_bits():
     first = load_scene(**SMALL)
-    capture._open.cache_clear()
+    capture._kept.cache_clear()
     again = load_scene(**SMALL)
     assert first.fingerprint == again.fingerprint
     assert torch.equal(first.points, again.points)
@@ -136,12 +136,12 @@ def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, ca
     assert same(load_scene(**cached, points=7), load_scene(**SMALL, points=7))
     [file] = (tmp_path / "cache").iterdir()
 
-    capture._open.cache_clear()  # as another process would begin
+    capture._kept.cache_clear()  # as another process would begin
     monkeypatch.setattr(capture, "photograph", lambda *_: pytest.fail("traced again"))
     assert same(traced, load_scene(**cached))
 
     monkeypatch.undo()
-    capture._open.cache_clear()
+    capture._kept.cache_clear()
     file.write_bytes(file.read_bytes()[:1000])
     assert same(traced, load_scene(**cached))
     assert "could not be read" in caplog.text

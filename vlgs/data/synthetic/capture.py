@@ -15,11 +15,12 @@ from vlgs.data.synthetic.cameras import camera_at, held, moments, stop_at
 from vlgs.data.synthetic.layouts import build
 from vlgs.data.synthetic.masks import LEVELS, NO_NOISE, Region
 from vlgs.data.synthetic.photographs import TracedImage, exposures, photograph
+from vlgs.data.synthetic.scene_file import SceneFile
 from vlgs.data.synthetic.settings import SceneSettings
 from vlgs.data.synthetic.world import World
 from vlgs.data.untrusted.arrays import Archive
 from vlgs.files import write_atomically
-from vlgs.types import IGNORE_ID, Camera
+from vlgs.types import Camera
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +44,19 @@ class Capture:
     """What does not depend on faults, points and level."""
 
     world: World
-    classes: tuple[str, ...]
-    class_of_part: np.ndarray
     train: tuple[Shot, ...]
     test: tuple[Shot, ...]
+
+
+def open_world(settings: SceneSettings) -> World:
+    """What is photographed; built once, as every rendered image that is given masks asks for it again."""
+    return _built(settings.scene, settings.difficulty, settings.seed)
+
+
+@functools.lru_cache(maxsize=2)
+def _built(scene: SceneFile, difficulty: str, seed: int) -> World:
+    things = build(scene, difficulty, np.random.default_rng([_LAYOUT, seed]))
+    return World(things, scene.light)
 
 
 def open_capture(settings: SceneSettings, cache: Path | None = None) -> Capture:
@@ -54,21 +64,19 @@ def open_capture(settings: SceneSettings, cache: Path | None = None) -> Capture:
 
     Args:
         settings: Of the scene; its points and faults do not matter here.
-        cache: Folder that keeps photographs between processes; None: they are kept in memory only.
+        cache: Folder that keeps photographs between processes; None: those of the last two scenes are kept in memory.
     """
-    return _open(replace(settings, points=0, faults=NO_NOISE), cache)
+    same = replace(settings, points=0, faults=NO_NOISE)
+    return _kept(same) if cache is None else _open(same, cache)
 
 
 @functools.lru_cache(maxsize=2)
+def _kept(settings: SceneSettings) -> Capture:
+    return _open(settings, None)
+
+
 def _open(settings: SceneSettings, cache: Path | None) -> Capture:
-    things = build(
-        settings.scene, settings.difficulty, np.random.default_rng([_LAYOUT, settings.seed])
-    )
-    world = World(things, settings.scene.light)
-    classes = tuple(dict.fromkeys(thing.name for thing in things if thing.masked))
-    class_of_thing = np.array(
-        [classes.index(thing.name) if thing.masked else IGNORE_ID for thing in things], np.uint8
-    )
+    world = open_world(settings)
     train, test = moments(settings.train_views, settings.test_views)
     order = np.argsort(np.argsort(np.concatenate([train, test])))
     places = []
@@ -91,13 +99,8 @@ def _open(settings: SceneSettings, cache: Path | None) -> Capture:
         places.append((f"frame_{position + 1:05d}", number, camera))
     photos = _photographs(world, [camera for *_, camera in places], settings, cache)
     shots = [Shot(n, k, c, photo) for (n, k, c), photo in zip(places, photos, strict=True)]
-    return Capture(
-        world,
-        classes,
-        class_of_thing[world.thing_of_part],
-        tuple(shots[: settings.train_views]),
-        tuple(shots[settings.train_views :]),
-    )
+    views = settings.train_views
+    return Capture(world, tuple(shots[:views]), tuple(shots[views:]))
 
 
 def _photographs(

@@ -2,6 +2,7 @@
 
 import zlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vlgs.data.synthetic.capture import Capture, Shot, open_capture, regions
+from vlgs.data.synthetic.capture import Shot, open_capture, open_world, regions
 from vlgs.data.synthetic.labels import dense_labels, object_labels
 from vlgs.data.synthetic.language import vocabulary
 from vlgs.data.synthetic.masks import LEVELS, LabelNoise, LevelMasks, level_masks, view_masks
@@ -17,7 +18,8 @@ from vlgs.data.synthetic.photographs import TracedImage, photograph
 from vlgs.data.synthetic.points import view_points
 from vlgs.data.synthetic.scene_file import find_scene
 from vlgs.data.synthetic.settings import MAX_VIEWS, SceneSettings
-from vlgs.types import Camera, Scene, View
+from vlgs.data.synthetic.world import World
+from vlgs.types import Camera, ObjectLabels, Scene, View
 
 _POINTS = 102  # purpose of draws
 
@@ -65,9 +67,10 @@ def load_scene(
     )
     folder = None if cache is None else Path(cache)
     capture = open_capture(settings, folder)
+    world = capture.world
     indices, vectors, offset = {}, [], 0
     for shot in capture.train:
-        masks = _masks(settings, capture, shot.photo, shot.number, level)
+        masks = _masks(settings, world, shot.photo, shot.number, level)
         indices[shot.name] = np.where(masks.index >= 0, masks.index + offset, -1).astype(np.int32)
         vectors.append(masks.vectors)
         offset += masks.vectors.shape[0]
@@ -75,22 +78,22 @@ def load_scene(
     for index in indices.values():
         areas += np.bincount(index[index >= 0], minlength=offset)
     cloud = [
-        view_points(capture.world, shot.camera, shot.photo, count, _draws(settings, shot))
+        view_points(world, shot.camera, shot.photo, count, _draws(settings, shot))
         for shot, count in zip(capture.train, _shares(points, train_views), strict=True)
     ]
     return Scene(
         name=file.name,
-        train=tuple(_view(capture, shot, indices[shot.name]) for shot in capture.train),
-        test=tuple(_view(capture, shot, None) for shot in capture.test),
+        train=tuple(_view(world, shot, indices[shot.name]) for shot in capture.train),
+        test=tuple(_view(world, shot, None) for shot in capture.test),
         split="synthetic",
         points=torch.cat([xyz for xyz, _ in cloud]),
         point_colors=torch.cat([rgb for _, rgb in cloud]),
         mask_vectors=torch.from_numpy(np.concatenate(vectors)),
         mask_areas=torch.from_numpy(areas).float(),
-        classes=capture.classes,
-        class_kinds={thing.name: thing.kind for thing in capture.world.things if thing.masked},
-        vocabulary=vocabulary(capture.classes),
-        supervise=lambda camera, number: _supervise(settings, folder, level, camera, number),
+        classes=world.classes,
+        class_kinds={thing.name: thing.kind for thing in world.things if thing.masked},
+        vocabulary=vocabulary(world.classes),
+        supervise=partial(_supervise, settings, level),
         fingerprint=settings.fingerprint(level),
     )
 
@@ -103,7 +106,7 @@ def language_levels(
     return {
         shot.name: view_masks(
             *regions(capture.world, shot.photo),
-            capture.classes,
+            capture.world.classes,
             settings.faults.resolve(settings.difficulty),
             _key(settings, shot.number),
         )
@@ -112,24 +115,24 @@ def language_levels(
 
 
 def _supervise(
-    settings: SceneSettings, cache: Path | None, level: int, camera: Camera, number: int
+    settings: SceneSettings, level: int, camera: Camera, number: int
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "m e"]]:
     """Language maps of a rendered image, in place of SAM and CLIP: the exact regions at its camera, with errors like those of a photograph.
 
     Real extractors would also stumble over the faults of the render.
     """
-    capture = open_capture(settings, cache)
-    photo = photograph(capture.world, camera)
-    masks = _masks(settings, capture, photo, MAX_VIEWS + 1 + number, level)
+    world = open_world(settings)
+    photo = photograph(world, camera)
+    masks = _masks(settings, world, photo, MAX_VIEWS + 1 + number, level)
     return torch.from_numpy(masks.index.astype(np.int32)), torch.from_numpy(masks.vectors)
 
 
 def _masks(
-    settings: SceneSettings, capture: Capture, photo: TracedImage, number: int, level: int
+    settings: SceneSettings, world: World, photo: TracedImage, number: int, level: int
 ) -> LevelMasks:
     faults = settings.faults.resolve(settings.difficulty)
-    found = regions(capture.world, photo, (level,) if level else LEVELS)
-    return level_masks(*found, capture.classes, faults, _key(settings, number), level)
+    found = regions(world, photo, (level,) if level else LEVELS)
+    return level_masks(*found, world.classes, faults, _key(settings, number), level)
 
 
 def _key(settings: SceneSettings, number: int) -> tuple[int, ...]:
@@ -138,21 +141,22 @@ def _key(settings: SceneSettings, number: int) -> tuple[int, ...]:
     return settings.seed, place, number
 
 
-def _view(capture: Capture, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:
-    photo = shot.photo
-    ids = capture.class_of_part[photo.part]
-    things = capture.world.thing_of_part[photo.part]
-    asked = {
-        capture.classes.index(t.name): t.name for t in capture.world.things if not t.background
-    }
-    smallest = max(4, round(5e-4 * ids.size))
+def _view(world: World, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:
+    # Labels are made when they are asked for: those of hundreds of large photographs would be gigabytes.
+    part = shot.photo.part
+    asked = {world.classes.index(t.name): t.name for t in world.things if not t.background}
+    smallest = max(4, round(5e-4 * part.size))
+
+    def objects() -> ObjectLabels:
+        return object_labels(world.class_of_part[part], world.thing_of_part[part], asked, smallest)
+
     return View(
         name=shot.name,
         camera=shot.camera,
-        read_image=_reader(photo.image),
+        read_image=_reader(shot.photo.image),
         read_masks=None if index is None else _reader(index),
-        read_object_labels=lambda: object_labels(ids, things, asked, smallest),
-        read_dense_labels=lambda: dense_labels(ids.copy()),
+        read_object_labels=objects,
+        read_dense_labels=lambda: dense_labels(world.class_of_part[part]),
     )
 
 

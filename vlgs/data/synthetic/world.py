@@ -11,6 +11,7 @@ from vlgs.data.synthetic.lights import Light
 from vlgs.data.synthetic.objects import Part, Thing
 from vlgs.data.synthetic.room import FLOOR, LAMP, ROOM, TABLE_RADIUS
 from vlgs.data.synthetic.shapes import Box, Revolution, Vectors
+from vlgs.types import IGNORE_ID
 
 NOTHING = 255
 """Part number of a ray that hits nothing; does not happen from inside the room."""
@@ -59,6 +60,10 @@ class World:
         self.light = light
         self.parts: tuple[Part, ...] = tuple(part for thing in things for part in thing.parts)
         self.thing_of_part = np.repeat(np.arange(len(things)), [len(t.parts) for t in things])
+        masked = [thing.name for thing in things if thing.masked]
+        self.classes: tuple[str, ...] = tuple(dict.fromkeys(masked))
+        classes = [self.classes.index(t.name) if t.masked else IGNORE_ID for t in things]
+        self.class_of_part = np.array(classes, np.uint8)[self.thing_of_part]
         self._rotations = [np.array(part.rotation) for part in self.parts]
         self._centers = [np.array(part.center)[:, None] for part in self.parts]
         bounds = [part.shape.bound() for part in self.parts]
