@@ -18,6 +18,7 @@ from tables_fakes import BENCHMARK, TABLE, balanced, fake_runs, filled_of, value
 
 from vlgs.tables.benchmark import Benchmark
 from vlgs.tables.gallery import FILE, FOLDER, GalleryView, Shown, read_gallery, write_gallery
+from vlgs.tables.grid import arrange, means_first
 from vlgs.tables.latex import to_latex
 from vlgs.tables.markdown import to_markdown
 from vlgs.tables.registry import Table, load_table
@@ -179,6 +180,9 @@ def test_a_wide_table_is_panels_that_keep_scenes_whole(tiny: Table, tmp_path: Pa
     parts = to_markdown(filled_of(tiny, tmp_path, many)).split("\n\n")[2:5]
     assert [part.count(" mIoU (%)") for part in parts] == [1, 4, 4]
     assert all(part.count("\n") == 1 + len(tiny.rows) for part in parts)
+    grid = means_first(arrange(filled_of(tiny, tmp_path, many)))
+    assert [column for column, _ in grid.columns[::2]] == ["avg", *many.scenes]
+    assert [entry.mean for entry in grid.lines[1].entries[:4:2]] == pytest.approx([35.0, 0.0])
 
 
 def test_a_field_without_gaussians_is_not_the_smallest(tiny: Table, tmp_path: Path):

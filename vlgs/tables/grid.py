@@ -96,11 +96,21 @@ def in_panels(grid: Grid) -> list[Grid]:
     numbers = len(grid.columns) // len(names) * len(others)
     size = math.ceil(len(others) / math.ceil(numbers / MOST))
     parts = [others[first : first + size] for first in range(0, len(others), size)]
-    return [_narrowed(grid, part) for part in ([means] if means else []) + parts]
+    return [
+        _chosen(grid, [i for i, (column, _) in enumerate(grid.columns) if column in part])
+        for part in ([means] if means else []) + parts
+    ]
 
 
-def _narrowed(grid: Grid, shown: Sequence[str]) -> Grid:
-    kept = [i for i, (column, _) in enumerate(grid.columns) if column in shown]
+def means_first(grid: Grid) -> Grid:
+    """A wide grid with its means over scenes before what is of one scene, as its end is out of sight."""
+    if len(grid.columns) <= MOST:
+        return grid
+    places = range(len(grid.columns))
+    return _chosen(grid, sorted(places, key=lambda i: grid.columns[i][0] != AVERAGE))
+
+
+def _chosen(grid: Grid, kept: Sequence[int]) -> Grid:
     return replace(
         grid,
         columns=tuple(grid.columns[i] for i in kept),
@@ -202,8 +212,3 @@ def caption(filled: Filled) -> str:
 def has_paper(filled: Filled) -> bool:
     """Whether any value of the paper is printed."""
     return any(math.isfinite(cell.paper) for cell in filled.cells.values())
-
-
-def average_index(grid: Grid) -> int | None:
-    """Entry that holds the average."""
-    return next((i for i, (column, _) in enumerate(grid.columns) if column == AVERAGE), None)

@@ -19,7 +19,7 @@ from vlgs.tables.budget_plot import differences_by_budget
 from vlgs.tables.fill import Filled
 from vlgs.tables.frame import Line
 from vlgs.tables.gallery import GalleryView, read_gallery
-from vlgs.tables.grid import Entry, arrange, caption, has_paper, number
+from vlgs.tables.grid import Entry, arrange, caption, has_paper, means_first, number
 from vlgs.tables.grid import Line as GridLine
 from vlgs.tables.said import say
 from vlgs.text import to_bytes, visible
@@ -190,7 +190,7 @@ def _listed(values: "pd.Series[Any]") -> str:
 
 
 def _section(filled: Filled, picture: Picture | None) -> dict[str, Any]:
-    grid, paper = arrange(filled), has_paper(filled)
+    grid, paper = means_first(arrange(filled)), has_paper(filled)
     said = say(filled)
     marks = len(grid.mark_names)
     groups = itertools.groupby(grid.lines, key=lambda line: line.group)
