@@ -44,18 +44,30 @@ def check_config(config: DictConfig) -> None:
     Raises:
         ValueError: Names the key, what it must be and what it is.
     """
-    try:
-        missing = sorted(OmegaConf.missing_keys(config))
-    except OmegaConfBaseException as error:
-        raise _unresolved(error) from error
-    if missing:
-        raise ValueError(f"config: {missing[0]} must be given, as {missing[0]}=VALUE; got nothing")
+    require_given(config)
     check_targets(config)
     _check_root(config)
     if config.levels != "single" and "level" not in config.data:
         raise ValueError(
             f"config: data must have mask levels with levels={config.levels}, got no data.level"
         )
+
+
+def require_given(config: DictConfig) -> None:
+    """Do nothing if every value is given that has no default.
+
+    Raises:
+        ValueError: Names the first key without one.
+    """
+    plain = OmegaConf.to_container(
+        config
+    )  # not resolved: what is not given may be all that another value lacks
+    places = [
+        join(key, name) for key, node in nodes(plain) for name, v in node.items() if v == "???"
+    ]
+    if places:
+        first = min(places)
+        raise ValueError(f"config: {first} must be given, as {first}=VALUE; got nothing")
 
 
 def check_targets(
@@ -74,6 +86,7 @@ def check_targets(
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     except OmegaConfBaseException as error:
+        require_given(config)
         raise _unresolved(error) from error
     assert isinstance(plain, dict)
     plain = {str(key): value for key, value in plain.items() if key != "hydra"}
@@ -109,6 +122,12 @@ def _require_place(results: str) -> None:
 
 def _unresolved(error: OmegaConfBaseException) -> ValueError:
     reason = str(error).strip().partition("\n")[0]
+    nothing = re.fullmatch(r".* returned `None` of type .*: \$\{\.(\w+)\}", reason)
+    if nothing:
+        beside = join((error.full_key or "").rpartition(".")[0], nothing[1])
+        return ValueError(
+            f"config: {beside} must be given, as {beside}=VALUE; got nothing, and {error.full_key} needs it"
+        )
     former = next((old for old in FORMER.values() if f"'{old}" in reason), None)
     hint = f"; {former} is called {renamed(former)} now" if former is not None else ""
     return ValueError(f"config: {error.full_key} must have a value, got: {reason}{hint}")

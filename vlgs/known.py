@@ -6,7 +6,7 @@ A file of `conf` mirrors the arguments of the class that it names, so that these
 import difflib
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -255,6 +255,15 @@ def _top(name: str) -> frozenset[str]:
     return frozenset(kept | chosen(name) | brought)
 
 
+def _places(path: Path, defaults: Iterable[Any]) -> Iterator[str]:
+    """Keys that the options fill which a file of `conf` chooses from groups below its own."""
+    for entry in defaults:
+        for group, option in entry.items() if isinstance(entry, Mapping) else ():
+            file = path.parent / str(group) / f"{option}.yaml"
+            if file.is_file():
+                yield place(file)
+
+
 @cache
 def _schema() -> _Schema:
     found: dict[str, set[str]] = defaultdict(set, loggers=set(_LOGGERS))
@@ -265,9 +274,17 @@ def _schema() -> _Schema:
     files = [path for path in CONF.rglob("*.yaml") if path.relative_to(CONF).parts[0] != "hydra"]
     read = [(path, *pair) for path in sorted(files) for pair in nodes(contents(path), place(path))]
     every = [(key, node) for _, key, node in read]
+    here: dict[tuple[Path, str], str] = {}
     for path, key, node in read:
-        if path.parent.name == last(key) and "_target_" in node:
-            naming[last(key), node["_target_"]] += (path,)
+        if "_target_" in node:
+            here[path, key] = node["_target_"]
+            if path.parent.name == last(key):
+                naming[last(key), node["_target_"]] += (path,)
+    for path, _, node in read:
+        for filled in _places(path, node.get("defaults") or ()):
+            whole, _, name = filled.rpartition(".")
+            if (path, whole) in here:
+                names[here[path, whole]].add(name)
     for key, node in every:
         keys |= {key, *(join(key, name) for name in node if name != "defaults")}
         target = node.get("_target_")

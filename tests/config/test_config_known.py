@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
 from hydra.utils import get_object
+from omegaconf import open_dict
 
 from vlgs.command import check_command
+from vlgs.config import check_config, check_targets
 from vlgs.known import CONF, contents, groups, nodes, options, place
 from vlgs.manual import describe
 
@@ -70,3 +73,40 @@ def test_help_of_an_option_has_defaults_and_comments(capsys: pytest.CaptureFixtu
     assert "data.scene=???" in out
     assert "figurines, ramen, teatime, waldo_kitchen" in out
     assert "output size as a fraction of the image file's" in out
+
+
+FEATURES = [
+    ("features", name) for name in options("features") if name != "own"
+]  # whose class is to be given
+FEATURES += [(group, name) for group in ("features/encoder", "features/segmenter") for name in options(group)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("group", "option"), FEATURES)
+def test_each_way_to_make_features_has_keys_that_are_read(group: str, option: str):
+    given = ["data.root=scene", f"{group}={option}"]
+    if option == "maps":
+        given.append("features.extractor.encoder.folder=maps")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("features", overrides=given)
+    check_targets(config, "features")
+    with open_dict(config):
+        config.features.extractor.unheard = 1
+    with pytest.raises(
+        ValueError, match=r"features\.extractor\.unheard must be a key that is read"
+    ):
+        check_targets(config, "features")
+
+
+@pytest.mark.parametrize(
+    ("given", "missing"),
+    [
+        (["data=lerf_ovs"], r"data\.root"),
+        (["data=mipnerf360"], r"data\.root"),
+        (["data=mipnerf360", "data.root=scenes"], r"data\.scene"),
+    ],
+)
+def test_what_other_values_are_made_of_must_be_given(given: list[str], missing: str):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=given)
+    with pytest.raises(ValueError, match=rf"^config: {missing} must be given, as {missing}=VALUE;"):
+        check_config(config)

@@ -4,12 +4,12 @@ import sys
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 
 from vlgs.arguments import take_command_line
 from vlgs.command import check_command
-from vlgs.config import CONF, check_targets
+from vlgs.config import CONF, check_targets, require_given
 from vlgs.features import job as work
 
 STOPPED = 130
@@ -20,9 +20,7 @@ STOPPED = 130
 def main(config: DictConfig) -> None:
     """Make the language maps that a scene lacks."""
     try:
-        missing = sorted(OmegaConf.missing_keys(config))
-        if missing:
-            raise ValueError(f"features: {missing[0]} must be given, as {missing[0]}=VALUE")
+        require_given(config)
         check_targets(config, "features")
         torch.set_num_threads(config.threads)
         extract(config)
