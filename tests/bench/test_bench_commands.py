@@ -108,6 +108,19 @@ def test_bad_input_is_one_line_and_status_1(tmp_path: Path, capsys: pytest.Captu
     assert "recipe must be one of default" in capsys.readouterr().err
 
 
+def test_ctrl_c_is_one_line_and_status_130(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vlgs.bench.train.run_train", interrupted)
+    assert main(["train", "--quick", "--out", str(tmp_path)]) == 130
+    said = capsys.readouterr().err
+    assert said.startswith("stopped; ")
+    assert said.count("\n") == 1
+
+
 @pytest.mark.parametrize("former", ["stress", "fuzz"])
 def test_a_former_subcommand_says_where_it_went(former: str, capsys: pytest.CaptureFixture[str]):
     assert main([former, "--quick"]) == 1

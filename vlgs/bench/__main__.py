@@ -359,6 +359,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        from vlgs.runs import STOPPED
+
+        print("stopped; what is written stays, and a training goes on from there", file=sys.stderr)
+        return STOPPED
 
 
 def _run_all(args: Namespace) -> int:
