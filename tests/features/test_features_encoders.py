@@ -150,3 +150,5 @@ def test_a_missing_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch,
     encoder = ImageEncoder(Pretrained(name="lab/model", weights=str(tmp_path)))
     with pytest.raises(ValueError, match=r"transformers: must be installed.*vlgs\[features\]"):
         encoder(noise(), [Mask(0, 0, np.ones((1, 1), bool))], "a")
+    with pytest.raises(ValueError, match=r"huggingface_hub: must be installed.*vlgs\[features\]"):
+        ImageEncoder(Pretrained(name="lab/model")).identity()

@@ -9,6 +9,7 @@ import torch
 
 from vlgs.data.diagnostics import SceneError
 from vlgs.data.untrusted.text import read_json
+from vlgs.extras import require_extra
 
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"
 WEIGHTS, SHARDS = "model.safetensors", "model.safetensors.index.json"
@@ -127,6 +128,7 @@ class Pretrained:
             return Path(self.weights) / self.name.rpartition("/")[2]
         if Path(self.name).is_dir():
             return Path(self.name)
+        require_extra("huggingface_hub", "features")
         from huggingface_hub import constants, try_to_load_from_cache
 
         cached = try_to_load_from_cache(self.name, CONFIG) if self.name.count("/") == 1 else None
