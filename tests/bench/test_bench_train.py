@@ -119,7 +119,7 @@ def test_the_last_iteration_is_evaluated():
 def test_a_training_that_was_stopped_goes_on_with_its_clocks_and_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    scenes = {"large": (*train.QUICK, "trainer.iterations=9", "trainer.checkpoint_every=4")}
+    scenes = {"large": (*train.QUICK, "trainer.iterations=9", "trainer.checkpoint_every=1")}
     evaluate, stopped_at = curve.Curve.evaluate, []
 
     def killed(self: curve.Curve, module: TrainedModule) -> None:
@@ -128,7 +128,7 @@ def test_a_training_that_was_stopped_goes_on_with_its_clocks_and_points(
         evaluate(self, module)
 
     monkeypatch.setattr(curve.Curve, "evaluate", killed)
-    for stop in (5, 9):  # after a checkpoint; then after the last, before its evaluation
+    for stop in (1, 5, 9):  # each after its checkpoint, before its evaluation
         stopped_at.append(stop)
         with pytest.raises(RuntimeError, match="killed"):
             train.run_train(scenes, ["neither"], tmp_path, 3, 1, [0])

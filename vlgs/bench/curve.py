@@ -47,7 +47,7 @@ class Curve(AfterStep):
         self.points: list[CurvePoint] = []
         self.wall = self.cpu = 0.0
         self.started = (0.0, 0.0)
-        self.meta: dict[str, Any] = {}
+        self.meta: dict[str, Any] = {"wall": 0.0, "cpu": 0.0, "points": []}
 
     def resume(self, meta: Mapping[str, Any]) -> None:
         """Go on from what a checkpoint says."""
