@@ -35,13 +35,13 @@ def build(isas: list[str]) -> Path:
 
 def fuzz_here(module: Path, isa: str, seeds: range) -> None:
     """In the child process: put the module in the place of the installed one, fuzz, print the report as the last line."""
-    spec = importlib.util.spec_from_file_location("vlgs._csrc", module)
+    spec = importlib.util.spec_from_file_location("vlgs.ops._csrc", module)
     assert spec is not None
     assert spec.loader is not None
-    sys.modules["vlgs._csrc"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(sys.modules["vlgs._csrc"])
+    sys.modules["vlgs.ops._csrc"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules["vlgs.ops._csrc"])
     from tests.fuzz_kernel import fuzz
-    from vlgs import _csrc
+    from vlgs.ops import _csrc
 
     assert _csrc.__file__ == str(module)
     if _csrc.isa() != isa:

@@ -17,7 +17,7 @@ from vlgs.indicator import Learned
 from vlgs.opened import NamedCamera, OpenedRun
 from vlgs.opened.files import SceneNotes
 from vlgs.opened.words import Words
-from vlgs.query import LerfRelevancy
+from vlgs.queries import LerfRelevancy
 from vlgs.types import Camera, RasterConfig, Vocabulary
 
 THINGS = ("red ball", "green ball", "table")

@@ -19,7 +19,7 @@ from vlgs.identity import GIVEN_FILES, RunIdentity, given_folders, identity, run
 from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.places import record
-from vlgs.query import Query, TextEncoder
+from vlgs.queries import Query, TextEncoder
 from vlgs.training.augment import Augment
 from vlgs.training.build import Parts
 from vlgs.training.levels import LEVEL_OPTIONS, Levels

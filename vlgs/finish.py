@@ -13,7 +13,7 @@ from vlgs.identity import RESULTS_VERSION
 from vlgs.known import option
 from vlgs.opened.files import write_field
 from vlgs.prepare import Prepared
-from vlgs.query import Learning, TextEncoder
+from vlgs.queries import Learning, TextEncoder
 from vlgs.report.answer import KeptAnswers
 from vlgs.report.evaluate import evaluate, prompts_of
 from vlgs.report.pictures import drawn, write_pictures

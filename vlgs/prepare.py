@@ -14,8 +14,8 @@ from vlgs.experiment import Experiment, Scenes
 from vlgs.formats import file_digest, folder_digest
 from vlgs.heads import FittedHead
 from vlgs.ops.rasterize import check_config as check_constants
-from vlgs.query import Particular, TextEncoder, encode_questions, words_of
-from vlgs.query.text import VocabularyText
+from vlgs.queries import Particular, TextEncoder, encode_questions, words_of
+from vlgs.queries.text import VocabularyText
 from vlgs.report.evaluate import evaluate
 from vlgs.runs import RunFolder
 from vlgs.training.build import Parts

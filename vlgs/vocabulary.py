@@ -11,8 +11,8 @@ import numpy as np
 
 from vlgs.data.untrusted.text import read_text
 from vlgs.files import write_atomically
-from vlgs.query.relevancy import CANONICAL_NEGATIVES
-from vlgs.query.text import CLIP_MODEL, ClipText, TextEncoder
+from vlgs.queries.relevancy import CANONICAL_NEGATIVES
+from vlgs.queries.text import CLIP_MODEL, ClipText, TextEncoder
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

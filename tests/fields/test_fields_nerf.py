@@ -10,7 +10,7 @@ from vlgs.fields.language_field import LanguageConfig, LanguageField
 from vlgs.fields.nerf import NerfField, along
 from vlgs.fields.radiance import Frame, RadianceConfig, RadianceField, Samples
 from vlgs.fields.rays import Rays, Spacing, pixel_rays
-from vlgs.query.relevancy import LerfRelevancy
+from vlgs.queries.relevancy import LerfRelevancy
 from vlgs.types import Camera
 
 GRID = GridConfig(2, 2, 4, 8, 8)

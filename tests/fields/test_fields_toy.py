@@ -23,8 +23,8 @@ from vlgs.fields.cloud import write_point_cloud
 from vlgs.fields.several import SeveralFields
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.metrics.select3d import Select3d
-from vlgs.query import LerfRelevancy
-from vlgs.query.text import VocabularyText
+from vlgs.queries import LerfRelevancy
+from vlgs.queries.text import VocabularyText
 from vlgs.report.evaluate import Evaluation, evaluate, prompts_of
 from vlgs.report.pictures import write_pictures
 from vlgs.report.results import write_metrics

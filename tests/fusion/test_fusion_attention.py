@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from vlgs import _csrc
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.mlp import MLP
+from vlgs.ops import _csrc
 from vlgs.ops.attention import Token
 
 READINGS = [(4, 1), (1, 4), (2, 3)]

@@ -13,7 +13,7 @@ from tests import fuzz_kernel as fuzz
 from tests.fuzz_kernel import run_scene
 from tests.fuzz_kernel.layers import run_layers
 from tests.fuzz_kernel.scene import SWITCHES, FuzzScene, make_scene
-from vlgs import _csrc
+from vlgs.ops import _csrc
 from vlgs.types import ChannelGroup
 
 

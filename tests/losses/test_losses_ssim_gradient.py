@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from vlgs import _csrc
 from vlgs.losses import l1_dssim, ssim, ssim_map
+from vlgs.ops import _csrc
 
 SIZES = [(1, 1, 3), (1, 17, 1), (9, 1, 5), (4, 30, 3), (12, 11, 1), (37, 21, 5)]
 

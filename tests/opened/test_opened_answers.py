@@ -7,7 +7,7 @@ from vlgs.fields import HasGaussians
 from vlgs.metrics.segment import blend, smooth
 from vlgs.opened import OpenedRun, open_run
 from vlgs.opened.answers import Range, ask_view, ranges, select_gaussians, tie
-from vlgs.query import LerfRelevancy, VocabSoftmax
+from vlgs.queries import LerfRelevancy, VocabSoftmax
 from vlgs.report.answer import answer_view
 
 

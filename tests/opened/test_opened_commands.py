@@ -14,7 +14,7 @@ from vlgs.fields import HasDepth
 from vlgs.gaussians.ply import read_ply
 from vlgs.opened import OpenedRun, open_run
 from vlgs.opened.answers import ask_view, ranges, select_gaussians
-from vlgs.query.__main__ import main as query
+from vlgs.query import main as query
 from vlgs.render.__main__ import main as render
 from vlgs.run import run
 from vlgs.runs import RunFolder

@@ -8,7 +8,7 @@ from tiny_models import save_clip
 
 from vlgs.opened.word_cache import CachedText, cache_folder
 from vlgs.opened.words import Words
-from vlgs.query.text import ClipText
+from vlgs.queries.text import ClipText
 from vlgs.types import Vocabulary
 
 

@@ -14,13 +14,17 @@ def imports_the_kernel(source: str) -> bool:
             names = {alias.name for alias in node.names}
         else:
             continue
-        if "vlgs._csrc" in names:
+        if "vlgs.ops._csrc" in names:
             return True
     return False
 
 
 def test_every_form_of_import_is_seen():
-    forms = ("from vlgs import _csrc", "import vlgs._csrc", "from vlgs._csrc import project")
+    forms = (
+        "from vlgs.ops import _csrc",
+        "import vlgs.ops._csrc",
+        "from vlgs.ops._csrc import project",
+    )
     assert all(map(imports_the_kernel, forms))
     assert not imports_the_kernel("from vlgs import rasterize")
 

@@ -13,7 +13,7 @@ from render_hard_scenes import HARD_SCENES
 from render_scenes import RenderScene, camera_at_origin, random_splats, sure_pixels
 from torch import Tensor
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 from vlgs.ops import rasterize_reference as reference
 from vlgs.ops.depth import render_depth
 from vlgs.types import Camera, DepthKind, RasterConfig
@@ -183,7 +183,7 @@ torch.set_num_threads(1)
 assert_agree(random_splats(60, seed=3))
 from test_render_depth import test_float32_within_its_promise
 test_float32_within_its_promise()
-from vlgs import _csrc
+from vlgs.ops import _csrc
 print(_csrc.isa())
 """
 

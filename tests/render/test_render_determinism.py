@@ -9,7 +9,7 @@ import pytest
 import torch
 from render_scenes import random_splats, render_with_gradients
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 
 
 @pytest.mark.parametrize("channels", [(3, 3), (3, 100)])
@@ -40,7 +40,7 @@ import sys
 sys.path.insert(0, sys.argv[1])
 import torch
 from render_scenes import random_splats, relative_error, render_with_gradients
-from vlgs import _csrc
+from vlgs.ops import _csrc
 torch.set_num_threads(1)
 print(_csrc.isa())
 for dtype, bound in ((torch.float32, 1e-4), (torch.float64, 1e-10)):
@@ -76,7 +76,7 @@ def test_what_can_run_is_known_and_the_best_of_it_runs():
 
 
 def test_an_unknown_instruction_set_is_refused():
-    command = [sys.executable, "-c", "from vlgs import _csrc; _csrc.isa()"]
+    command = [sys.executable, "-c", "from vlgs.ops import _csrc; _csrc.isa()"]
     environment = os.environ | {"VLGS_ISA": "avx9000"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert "VLGS_ISA: must be v4, v3 or base, got avx9000" in done.stderr

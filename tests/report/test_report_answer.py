@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 from report_fakes import FakeField, scene, vocabulary
 
-from vlgs.query import LerfRelevancy, Prompts, encode_prompts
-from vlgs.query.text import VocabularyText
+from vlgs.queries import LerfRelevancy, Prompts, encode_prompts
+from vlgs.queries.text import VocabularyText
 from vlgs.report import answer
 from vlgs.report.answer import KeptAnswers
 from vlgs.types import Scene

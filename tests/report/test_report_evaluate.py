@@ -13,8 +13,8 @@ from vlgs.metrics.lerf_ovs import LerfOvs
 from vlgs.metrics.ovs3d import Ovs3dArgmax, Ovs3dThreshold
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.metrics.select3d import Select3d
-from vlgs.query import LerfRelevancy, VocabSoftmax
-from vlgs.query.text import VocabularyText
+from vlgs.queries import LerfRelevancy, VocabSoftmax
+from vlgs.queries.text import VocabularyText
 from vlgs.report.evaluate import Evaluation, evaluate, prompts_of
 from vlgs.report.language import LanguageTally
 from vlgs.types import IGNORE_ID, Camera, DenseLabels, ObjectLabels, Scene

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from report_fakes import CLASSES, NEGATIVES, Drawing, FakeField, scene, view, vocabulary, with_test
 
-from vlgs.query import LerfRelevancy, Prompts
-from vlgs.query.text import VocabularyText
+from vlgs.queries import LerfRelevancy, Prompts
+from vlgs.queries.text import VocabularyText
 from vlgs.report import colors
 from vlgs.report.draw import Painter
 from vlgs.report.evaluate import prompts_of

@@ -5,8 +5,8 @@ import torch
 from report_fakes import FakeField, scene
 
 from vlgs.fields import FieldImages
-from vlgs.query import LerfRelevancy, Prompts, Query, VocabSoftmax
-from vlgs.query.text import VocabularyText
+from vlgs.queries import LerfRelevancy, Prompts, Query, VocabSoftmax
+from vlgs.queries.text import VocabularyText
 from vlgs.report import timing
 from vlgs.report.evaluate import prompts_of
 from vlgs.types import Camera

@@ -14,8 +14,8 @@ from tiny_runs import TINY, composed
 
 from vlgs.data.export import write_scene
 from vlgs.data.synthetic import SceneSettings, language_levels
-from vlgs.query import LerfRelevancy, VocabSoftmax, encode_questions, words_of
-from vlgs.query.text import VocabularyText
+from vlgs.queries import LerfRelevancy, VocabSoftmax, encode_questions, words_of
+from vlgs.queries.text import VocabularyText
 from vlgs.report.pictures import PictureLimits, write_pictures
 from vlgs.report.words import questions_of
 from vlgs.run import run

@@ -36,9 +36,9 @@ NO_GRADIENT = {
     "vlgs.heads.quantised.quantise": "before training",
     "vlgs.gaussians.parameters.complete": "before training",
     "vlgs.gaussians.parameters.conform": "before training",
-    "vlgs.query.Query.relevancy": "protocol",
-    "vlgs.query.Query.__call__": "protocol",
-    "vlgs.query.text.TextEncoder.encode": "protocol",
+    "vlgs.queries.Query.relevancy": "protocol",
+    "vlgs.queries.Query.__call__": "protocol",
+    "vlgs.queries.text.TextEncoder.encode": "protocol",
     "vlgs.indicator.Indicator.__call__": "protocol",
     "vlgs.fusion.none.NoFusion.forward": "returns its arguments",
     "vlgs.indicator.Fixed.__call__": "a constant",
@@ -62,14 +62,14 @@ NO_GRADIENT = {
     **{f"vlgs.fields.planes.PlaneGaussians.{name}": "training is over" for name in (
         "opacities", "language_weights", "gaussian_similarity", "render_values",
     )},
-    **{f"vlgs.query.{query}.{name}": "training is over" for query in ("hyperplane.Hyperplane", "objects.Objects")
+    **{f"vlgs.queries.{query}.{name}": "training is over" for query in ("hyperplane.Hyperplane", "objects.Objects")
        for name in ("relevancy", "__call__")},
-    "vlgs.query.hyperplane.hinge_slope": "a gradient itself",
+    "vlgs.queries.hyperplane.hinge_slope": "a gradient itself",
     **{f"vlgs.fields.trained.SplatField.{name}": "training is over" for name in (
         "similarity", "opacities", "language_weights", "gaussian_similarity", "render_values",
     )},
     **{f"vlgs.fields.{name}.objects": "a number of an object" for name in ("HasObjects", "trained.SplatField")},
-    **{f"vlgs.query.{name}": "a choice" for name in (
+    **{f"vlgs.queries.{name}": "a choice" for name in (
         "objects.choose_objects", "view_masks.MaskFolder.find", "view_masks.OwnMasks.find",
     )},
     "vlgs.fields.several.SeveralFields.similarity": "training is over",
@@ -102,8 +102,8 @@ NO_GRADIENT = {
         "planes.PlaneField.depth", "nerf.NerfField.depth",
     )},
     "vlgs.ops.cached_weights.Weights.render": "protocol",
-    "vlgs.query.text.VocabularyText.encode": "takes words",
-    "vlgs.query.text.ClipText.encode": "takes words",
+    "vlgs.queries.text.VocabularyText.encode": "takes words",
+    "vlgs.queries.text.ClipText.encode": "takes words",
 }  # fmt: skip
 
 

@@ -54,7 +54,7 @@ from vlgs.ops.neighbours import neighbour_products
 from vlgs.ops.rasterize import rasterize
 from vlgs.ops.squared_error import squared_error
 from vlgs.ops.view_color import view_color
-from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
+from vlgs.queries.relevancy import LerfRelevancy, VocabSoftmax
 from vlgs.types import Camera, ChannelGroup, DepthKind, Gaussians, RasterConfig
 from vlgs.view_blend import FixedBlend, blend_targets
 from vlgs.view_blend.pose import slerp
@@ -315,16 +315,16 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.fields.similarity.decoded_cosines": lambda: (
         lambda c, t: decoded_cosines(Identity(3).decode, c, t, chunk=4), [draw(3, 2, 3), draw(2, 3, seed=1)]
     ),
-    "vlgs.query.relevancy.LerfRelevancy.relevancy": lambda: (
+    "vlgs.queries.relevancy.LerfRelevancy.relevancy": lambda: (
         LerfRelevancy().relevancy, [draw(2, 4), draw(3, 4, seed=1)]
     ),
-    "vlgs.query.relevancy.LerfRelevancy.__call__": lambda: (
+    "vlgs.queries.relevancy.LerfRelevancy.__call__": lambda: (
         LerfRelevancy(), [draw(4, 3), draw(2, 3, seed=1), draw(2, 3, seed=2)]
     ),
-    "vlgs.query.relevancy.VocabSoftmax.relevancy": lambda: (
+    "vlgs.queries.relevancy.VocabSoftmax.relevancy": lambda: (
         VocabSoftmax().relevancy, [draw(2, 4), draw(3, 4, seed=1)]
     ),
-    "vlgs.query.relevancy.VocabSoftmax.__call__": lambda: (
+    "vlgs.queries.relevancy.VocabSoftmax.__call__": lambda: (
         VocabSoftmax(), [draw(4, 3), draw(2, 3, seed=1), draw(2, 3, seed=2)]
     ),
     "vlgs.indicator.Learned.__call__": lambda: (

@@ -33,7 +33,7 @@ from vlgs.gaussians.sh import rgb_to_sh
 from vlgs.heads.folded import Foldable
 from vlgs.indicator import Learned
 from vlgs.opened.answers import ask_view
-from vlgs.query import Questions, encode_prompts
+from vlgs.queries import Questions, encode_prompts
 from vlgs.report.pictures import spread as evenly
 from vlgs.types import Camera, RasterConfig
 

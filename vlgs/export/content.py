@@ -12,7 +12,7 @@ from vlgs.gaussians.ply import SH_COEFFICIENTS
 from vlgs.geometry import camera_center
 from vlgs.opened import OpenedRun
 from vlgs.opened.answers import LEAST, Range, gaussian_relevancy, ranges, select_gaussians
-from vlgs.query import Questions
+from vlgs.queries import Questions
 
 
 @dataclass(frozen=True)

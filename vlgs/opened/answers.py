@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vlgs.fields import NO_GAUSSIANS, Field, FieldImages, HasGaussians, gaussians_of
 from vlgs.metrics.segment import blend, smooth
-from vlgs.query import Query, Questions
+from vlgs.queries import Query, Questions
 from vlgs.report.answer import answer_view
 from vlgs.report.pictures import spread
 from vlgs.types import Camera

@@ -17,7 +17,7 @@ from vlgs.fields.saved import MakePart
 from vlgs.opened.files import NamedCamera, SceneNotes, field_of, read_field, read_scene
 from vlgs.opened.words import Words
 from vlgs.places import found_again
-from vlgs.query import Query, Questions
+from vlgs.queries import Query, Questions
 from vlgs.runs import RunFolder
 from vlgs.training.checkpoint import load_checkpoint
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vlgs.extras import require_extra
 from vlgs.files import write_atomically
-from vlgs.query.text import ClipText
+from vlgs.queries.text import ClipText
 
 
 def cache_folder() -> Path:
@@ -41,10 +41,10 @@ class CachedText:
         self.template = template
 
     def encode(self, names: Sequence[str]) -> Float[Tensor, "k e"]:
-        """See `vlgs.query.TextEncoder`.
+        """See `vlgs.queries.TextEncoder`.
 
         Raises:
-            ValueError: See `vlgs.query.text.ClipText`.
+            ValueError: See `vlgs.queries.text.ClipText`.
             OSError: If the weights are not on this machine.
         """
         weights = _weights_of(self.tower.model)

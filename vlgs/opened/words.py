@@ -11,15 +11,15 @@ from torch import Tensor
 
 from vlgs.data.language import read_vocabulary
 from vlgs.opened.word_cache import CachedText
-from vlgs.query import Query, Questions, encode_prompts
-from vlgs.query.relevancy import VocabSoftmax
-from vlgs.query.text import ClipText, VocabularyText
+from vlgs.queries import Query, Questions, encode_prompts
+from vlgs.queries.relevancy import VocabSoftmax
+from vlgs.queries.text import ClipText, VocabularyText
 from vlgs.types import Vocabulary
 
 
 @dataclass(frozen=True)
 class Words:
-    """A `vlgs.query.TextEncoder` that looks in several places, one after the other. All must be of one embedding space."""
+    """A `vlgs.queries.TextEncoder` that looks in several places, one after the other. All must be of one embedding space."""
 
     tables: Sequence[VocabularyText]
     tower: CachedText | None
@@ -65,7 +65,7 @@ class Words:
         return tuple(dict.fromkeys(names))
 
     def encode(self, names: Sequence[str]) -> Float[Tensor, "k e"]:
-        """See `vlgs.query.TextEncoder`.
+        """See `vlgs.queries.TextEncoder`.
 
         Raises:
             ValueError: If a word is in no table and there is no text tower; says what could encode it.

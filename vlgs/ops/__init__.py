@@ -1,4 +1,4 @@
-"""The differentiable operations, one a file, and the only code that imports the compiled kernels (`vlgs._csrc`).
+"""The differentiable operations, one a file, and the only code that imports the compiled kernels (`vlgs.ops._csrc`).
 
 A file holds the typed function that the package calls, the autograd function over the CPU's kernel, and ``KERNELS``, a table from
 the type of a device to what computes the operation there. Another device is one new file, ``<operation>_<device>.py`` beside the

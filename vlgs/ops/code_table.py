@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 
 
 def instruction_set() -> str:

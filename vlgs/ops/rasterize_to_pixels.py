@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 from vlgs.ops.arrays import array_list, arrays
 from vlgs.ops.device import Kernels, differentiated
 from vlgs.ops.project import Splats

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from vlgs import _csrc
+from vlgs.ops import _csrc
 from vlgs.ops.arrays import arrays
 from vlgs.ops.device import Kernels
 

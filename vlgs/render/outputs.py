@@ -12,7 +12,7 @@ from torch import Tensor
 from vlgs.fields import NO_LANGUAGE, FieldImages, HasDepth
 from vlgs.opened import OpenedRun
 from vlgs.opened.answers import Range, ask_view, ranges
-from vlgs.query import Questions
+from vlgs.queries import Questions
 from vlgs.report import colors
 from vlgs.report.features import FeatureColors, fit_feature_colors, paint_features
 from vlgs.report.pictures import spread

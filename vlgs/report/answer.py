@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fields import Field, FieldImages
-from vlgs.query import Prompts
+from vlgs.queries import Prompts
 from vlgs.types import Camera, View
 
 KEPT_BYTES = 64 * 2**20

@@ -11,7 +11,7 @@ from vlgs.fields import Field, HasGaussians
 from vlgs.metrics.dense import predict_classes
 from vlgs.metrics.masks import Unit
 from vlgs.metrics.segment import blend, segment, smooth
-from vlgs.query import Prompts, Query
+from vlgs.queries import Prompts, Query
 from vlgs.report import colors
 from vlgs.report.answer import Answer, KeptAnswers
 from vlgs.report.features import FeatureColors, fit_feature_colors, paint_features

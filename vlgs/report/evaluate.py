@@ -11,7 +11,7 @@ from vlgs.metrics import image
 from vlgs.metrics.masks import QueryScore
 from vlgs.metrics.mean import mean_of_known
 from vlgs.metrics.protocol import Auto, EvaluationProtocol, tag
-from vlgs.query import Prompts, Query, TextEncoder, encode_prompts
+from vlgs.queries import Prompts, Query, TextEncoder, encode_prompts
 from vlgs.report.answer import Answer, KeptAnswers
 from vlgs.report.indicator import Histogram
 from vlgs.report.language import DENSE, LERF_OVS, LanguageScores, LanguageTally

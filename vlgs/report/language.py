@@ -19,7 +19,7 @@ from vlgs.metrics.protocol import (
     GaussianEvidence,
     NotScorableError,
 )
-from vlgs.query import Prompts, Query
+from vlgs.queries import Prompts, Query
 from vlgs.report.answer import Answer
 from vlgs.report.labels import read_truth, read_units
 from vlgs.types import IGNORE_ID, View

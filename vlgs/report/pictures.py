@@ -12,7 +12,7 @@ from torch import Tensor
 from vlgs.fields import Field
 from vlgs.files import write_atomically
 from vlgs.names import file_names
-from vlgs.query import Prompts, Query
+from vlgs.queries import Prompts, Query
 from vlgs.report.answer import KeptAnswers
 from vlgs.report.draw import Painter, ViewPictures
 from vlgs.report.overview import PNG_LEVEL, count_difference, write_histogram, write_overview

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vlgs.fields import HasGaussians
 from vlgs.metrics.protocol import GaussianEvidence
-from vlgs.query import Prompts, Query
+from vlgs.queries import Prompts, Query
 from vlgs.types import Camera
 
 

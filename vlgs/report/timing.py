@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from vlgs.fields import Field
-from vlgs.query import Prompts, Query
+from vlgs.queries import Prompts, Query
 from vlgs.report.answer import answer_view
 from vlgs.types import Camera
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fields import Field
-from vlgs.query import (
+from vlgs.queries import (
     Prompts,
     Query,
     Questions,

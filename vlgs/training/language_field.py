@@ -14,7 +14,7 @@ from vlgs.fields import Field
 from vlgs.fields.language_field import LanguageConfig, LanguageField
 from vlgs.fields.nerf import NerfField, along
 from vlgs.fields.radiance import RadianceField
-from vlgs.query.relevancy import CANONICAL_NEGATIVES
+from vlgs.queries.relevancy import CANONICAL_NEGATIVES
 from vlgs.training.fit_learner import train_learner
 from vlgs.training.learner import Descent, Learner, generator_of
 from vlgs.training.radiance import NO_GAUSSIANS, rays_in

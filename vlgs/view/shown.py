@@ -15,7 +15,7 @@ from vlgs.geometry import resize_camera
 from vlgs.metrics.segment import LANGSPLAT, Constants, blend, smooth
 from vlgs.opened import OpenedRun
 from vlgs.opened.answers import Range, tie
-from vlgs.query import Questions
+from vlgs.queries import Questions
 from vlgs.report.features import FeatureColors, fit_feature_colors
 from vlgs.report.pictures import spread
 from vlgs.types import Camera

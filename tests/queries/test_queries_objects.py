@@ -16,9 +16,9 @@ from vlgs.fields.several import SeveralFields
 from vlgs.fields.trained import SplatField
 from vlgs.heads.classifier import Classifier
 from vlgs.opened import open_run
-from vlgs.query import Learning, Objects, Particular, Prompts, Query
-from vlgs.query.objects import choose_objects
-from vlgs.query.view_masks import MaskFolder
+from vlgs.queries import Learning, Objects, Particular, Prompts, Query
+from vlgs.queries.objects import choose_objects
+from vlgs.queries.view_masks import MaskFolder
 from vlgs.run import run
 from vlgs.runs import RunFolder
 from vlgs.training.build import build_module

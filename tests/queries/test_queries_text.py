@@ -6,8 +6,8 @@ import pytest
 import torch
 from tiny_models import save_clip, save_siglip
 
-from vlgs.query import LerfRelevancy, TextEncoder, VocabSoftmax, encode_prompts
-from vlgs.query.text import ClipText, VocabularyText
+from vlgs.queries import LerfRelevancy, TextEncoder, VocabSoftmax, encode_prompts
+from vlgs.queries.text import ClipText, VocabularyText
 from vlgs.types import Vocabulary
 
 WORDS = ("wine glass", "steel kettle", "red apple", "Pikachu")

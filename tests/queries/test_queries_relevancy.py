@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlgs.fields.similarity import cosines, decoded_cosines
-from vlgs.query import LerfRelevancy, Query, VocabSoftmax
+from vlgs.queries import LerfRelevancy, Query, VocabSoftmax
 
 QUERIES = (LerfRelevancy(), VocabSoftmax(), VocabSoftmax(negatives=("object",)))
 

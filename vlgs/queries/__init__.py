@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fields import Field
-from vlgs.query.hyperplane import Hyperplane
-from vlgs.query.objects import Objects
-from vlgs.query.prompts import Prompts, encode_prompts
-from vlgs.query.relevancy import LerfRelevancy, VocabSoftmax
-from vlgs.query.text import TextEncoder
-from vlgs.query.words import Questions, encode_questions, words_of
+from vlgs.queries.hyperplane import Hyperplane
+from vlgs.queries.objects import Objects
+from vlgs.queries.prompts import Prompts, encode_prompts
+from vlgs.queries.relevancy import LerfRelevancy, VocabSoftmax
+from vlgs.queries.text import TextEncoder
+from vlgs.queries.words import Questions, encode_questions, words_of
 from vlgs.types import Scene
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The two published ways from cosines to relevancy. Each is a frozen dataclass that satisfies `vlgs.query.Query`."""
+"""The two published ways from cosines to relevancy. Each is a frozen dataclass that satisfies `vlgs.queries.Query`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

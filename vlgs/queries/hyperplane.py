@@ -12,8 +12,8 @@ from torch.nn.functional import normalize
 from vlgs.fields import Field
 from vlgs.fields.planes import Plane, with_planes
 from vlgs.fields.similarity import cosines
-from vlgs.query.prompts import Prompts
-from vlgs.query.view_masks import masks_from
+from vlgs.queries.prompts import Prompts
+from vlgs.queries.view_masks import masks_from
 from vlgs.types import Scene
 from vlgs.values import require_range
 
@@ -31,7 +31,7 @@ class Hyperplane:
 
     A plane starts as the word itself and is moved by gradient descent on the hinge loss of the pixels of one training view, until
     its answer there overlaps the mask well enough. GOI takes this mask from a network that finds what words refer to. Here it comes from a
-    folder (`vlgs.query.view_masks.MaskFolder`), or it is one of the scene's own (`vlgs.query.view_masks.OwnMasks`).
+    folder (`vlgs.queries.view_masks.MaskFolder`), or it is one of the scene's own (`vlgs.queries.view_masks.OwnMasks`).
 
     Args:
         scale: Of the products; that of APE's embeddings in GOI.
@@ -89,7 +89,7 @@ class Hyperplane:
         return (cosines(features, text) / self.scale + (self.bias or 0.0)).sigmoid()
 
     def require(self, scene: Scene, words: Sequence[str]) -> None:
-        """Refuse masks that no word could be learned from; see `vlgs.query.Particular`."""
+        """Refuse masks that no word could be learned from; see `vlgs.queries.Particular`."""
         masks_from(self.masks, self.candidates).require(scene, words)
 
     @torch.no_grad()

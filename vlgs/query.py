@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from vlgs.opened import NamedCamera, OpenedRun
     from vlgs.opened.answers import Answers, Range
-    from vlgs.query import Questions
+    from vlgs.queries import Questions
 
 _HELP = """Writes for every word and view OUT/WORD/VIEW_heat.png (relevancy, from the lowest to the highest of the scene), _overlay.png (the same over
 the picture) and _mask.png (what answers is white), and prints the views, the best first.

@@ -12,8 +12,8 @@ from torch.nn.functional import normalize
 
 from vlgs.fields import Field, FieldImages
 from vlgs.fields.similarity import cosines
-from vlgs.query import Hyperplane, Learning, Particular, Prompts, Query
-from vlgs.query.hyperplane import hinge_slope
+from vlgs.queries import Hyperplane, Learning, Particular, Prompts, Query
+from vlgs.queries.hyperplane import hinge_slope
 from vlgs.types import Scene
 
 WIDTH = 8

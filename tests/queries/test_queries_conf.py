@@ -6,8 +6,8 @@ import hydra
 import pytest
 from omegaconf import OmegaConf
 
-from vlgs.query import LerfRelevancy, VocabSoftmax
-from vlgs.query.text import ClipText, VocabularyText
+from vlgs.queries import LerfRelevancy, VocabSoftmax
+from vlgs.queries.text import ClipText, VocabularyText
 
 CONF = Path(__file__).parents[2] / "conf"
 

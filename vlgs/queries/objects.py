@@ -14,8 +14,8 @@ from vlgs.demands import Demand
 from vlgs.fields import Field, HasObjects
 from vlgs.fields.several import SeveralFields
 from vlgs.fields.similarity import cosines
-from vlgs.query.prompts import Prompts
-from vlgs.query.view_masks import Found, masks_from
+from vlgs.queries.prompts import Prompts
+from vlgs.queries.view_masks import Found, masks_from
 from vlgs.types import Scene
 from vlgs.values import require_range
 
@@ -28,12 +28,12 @@ class Objects:
 
     An object belongs to a word where most of the pixels that show it lie inside of the mask; if there is none, the one that most pixels of the
     mask show does. The released program has this mask from a detector (Grounding DINO and SAM), in the first view that it renders. Here it comes from
-    a folder, or it is one of the scene's own, as for `vlgs.query.hyperplane.Hyperplane`. A word without a mask has no answer: 0 everywhere.
+    a folder, or it is one of the scene's own, as for `vlgs.queries.hyperplane.Hyperplane`. A word without a mask has no answer: 0 everywhere.
 
     Args:
         share: Of the pixels that show an object, how much has to lie inside; 0.7 is the released program's.
         candidates: How many of the scene's masks are looked at whose vectors are nearest to the word.
-        masks: Folder of ``<word>/<view>.png`` (`vlgs.query.view_masks.MaskFolder`); null: the scene's own masks.
+        masks: Folder of ``<word>/<view>.png`` (`vlgs.queries.view_masks.MaskFolder`); null: the scene's own masks.
 
     Raises:
         ValueError: If a number is out of range.
@@ -76,7 +76,7 @@ class Objects:
         return cosines(features, text).clamp(0, 1)
 
     def require(self, scene: Scene, words: Sequence[str]) -> None:
-        """Refuse masks that no word could be learned from; see `vlgs.query.Particular`."""
+        """Refuse masks that no word could be learned from; see `vlgs.queries.Particular`."""
         masks_from(self.masks, self.candidates).require(scene, words)
 
     @torch.no_grad()

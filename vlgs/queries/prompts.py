@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vlgs.query.text import TextEncoder
+from vlgs.queries.text import TextEncoder
 
 if TYPE_CHECKING:
-    from vlgs.query import Query
+    from vlgs.queries import Query
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from vlgs.query.prompts import Prompts, encode_prompts
-from vlgs.query.relevancy import VocabSoftmax
-from vlgs.query.text import TextEncoder
+from vlgs.queries.prompts import Prompts, encode_prompts
+from vlgs.queries.relevancy import VocabSoftmax
+from vlgs.queries.text import TextEncoder
 from vlgs.types import Scene
 
 if TYPE_CHECKING:
-    from vlgs.query import Query
+    from vlgs.queries import Query
 
 
 @dataclass(frozen=True)
