@@ -194,9 +194,10 @@ class SplatModel(nn.Module):
     def predict(self, feature: Float[Tensor, "h w c"]) -> Float[Tensor, "h wl t"]:
         """What a rendered map of codes is compared by (`Head.predict`); l mask levels stand beside each other in a row."""
         # A map of one level has this shape already; a view for nothing is measured in every step (`vlgs.bench.seams`).
-        if feature.shape[-1] != self.head.dim:
-            feature = feature.view(len(feature), -1, self.head.dim)
-        return self.head.predict(feature)
+        head = self.head
+        if feature.shape[-1] != head.dim:
+            feature = feature.view(len(feature), -1, head.dim)
+        return head.predict(feature)
 
     def view_color(self, fused: FusedGaussians, camera: Camera) -> Float[Tensor, "n 3"]:
         """RGB of every Gaussian as a camera sees it, >= 0."""
