@@ -307,6 +307,25 @@ def query(parser: ArgumentParser) -> Runner:
     return run
 
 
+def repeat(parser: ArgumentParser) -> Runner:
+    """One run of each committed table again, compared number by number; 1 if one differs on the same instruction set."""
+    parser.add_argument("--results", type=Path, default=Path("results"), help="with runs.csv")
+    parser.add_argument("--tables", nargs="+", default=[], help="labels; default: all")
+    parser.add_argument(
+        "--override", nargs="+", default=[], metavar="KEY=VALUE",
+        help="where the photographs are, e.g. data.root=SCENE data.features=FOLDER",
+    )  # fmt: skip
+
+    def run(args: Namespace) -> int:
+        from vlgs.bench.repeat import run_repeat
+
+        most = 1 if args.quick else None
+        rows = run_repeat(args.results, args.tables, args.override, args.out, args.seed, most)
+        return 0 if all(row.holds for row in rows) else 1
+
+    return run
+
+
 SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     kernel,
     error,
@@ -322,6 +341,7 @@ SUBCOMMANDS: tuple[Callable[[ArgumentParser], Runner], ...] = (
     protocols,
     query,
     startup,
+    repeat,
 )
 """Name, help and options of a subcommand are those of its function; `all` runs them in this order."""
 
