@@ -46,6 +46,8 @@ def test_photographs_are_told_where_their_language_is():
         train.scene_overrides(None, 0.5, False, further=further)
     with pytest.raises(ValueError, match=r"--no-synthetic must come with --root SCENE"):
         train.scene_overrides(None, 0.5, False, synthetic=False)
+    with pytest.raises(ValueError, match="--large must come with the procedural scene"):
+        train.scene_overrides(root, 0.5, quick=False, synthetic=False, large=True)
 
 
 def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

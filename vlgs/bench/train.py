@@ -128,8 +128,12 @@ def scene_overrides(
         large: Whether the procedural scene is as large as one of LERF.
 
     Raises:
-        ValueError: If there is no scene, or overrides for photographs that are not there.
+        ValueError: If there is no scene, or something is said of one that is not there.
     """
+    if large and not synthetic:
+        raise ValueError(
+            "bench: --large must come with the procedural scene, which it is of, got --no-synthetic"
+        )
     scenes: dict[str, tuple[str, ...]] = {}
     if synthetic:
         scenes["large" if large else "synthetic"] = QUICK if quick else LARGE if large else ()
