@@ -48,7 +48,7 @@ def trained_again(committed: Path, monkeypatch: pytest.MonkeyPatch, change: Chan
         commands.append(" ".join(command))
         chosen = next(
             one
-            for one in choose_runs(committed, (), False, 0)
+            for one in choose_runs(committed, (), (), 0)
             if " ".join(one.command) in commands[-1]
         )
         metrics = json.loads(
@@ -115,8 +115,8 @@ def test_another_instruction_set_may_differ(committed: Path, monkeypatch: pytest
 
 
 def test_another_seed_chooses_others(committed: Path):
-    found = [tuple(one.run for one in choose_runs(committed, (), False, s)) for s in range(8)]
-    assert found[0] == tuple(one.run for one in choose_runs(committed, (), False, 0))
+    found = [tuple(one.run for one in choose_runs(committed, (), (), s)) for s in range(8)]
+    assert found[0] == tuple(one.run for one in choose_runs(committed, (), (), 0))
     assert len(set(found)) > 1
 
 
@@ -139,11 +139,26 @@ def test_bad_input_is_one_line(
 def test_photographs_are_left_out_without_their_folder(
     committed: Path, capsys: pytest.CaptureFixture[str]
 ):
-    before = len(choose_runs(committed, (), False, 0))
+    before = len(choose_runs(committed, (), (), 0))
     street = Benchmark("street", ("data=colmap",), ("street",), (0,))
     street.extend(committed / "street" / "benchmark.yaml")
-    assert len(choose_runs(committed, (), False, 0)) == before
+    assert len(choose_runs(committed, (), (), 0)) == before
     assert "street is left out: --override says where" in capsys.readouterr().out
+
+
+def test_photographs_are_found_where_they_are_said_to_be(committed: Path):
+    table, street = load_tables()["convention"], ("data=colmap", "data.resize=0.5")
+    here = ("data.root=photographs/street", "data.features=maps")
+    benchmark = Benchmark("street", (*street, *here), ("street",), (0,))
+    shutil.move(committed.parent / "trained", committed / "runs")
+    fake_runs(committed, [table], benchmark, lambda *_: 0.5, more={"dataset": "colmap"})
+    benchmark.extend(committed / "street" / "benchmark.yaml")
+    write_all(committed, [table])
+    moved = ("data.root=elsewhere/street", "data.features=maps")
+    (one,) = (r for r in choose_runs(committed, (), moved, 0) if r.benchmark == "street")
+    assert one.command[:4] == (*street, *moved)
+    assert one.scene == "street"
+    assert not any(word.startswith("data.scene") for word in one.command)
 
 
 @pytest.mark.slow
@@ -156,11 +171,11 @@ def test_a_run_that_is_trained_again_has_the_same_numbers(tmp_path: Path):
     one = Recorded(
         "tiny", "convention", row.label, "glassware", 0, "", None, None, None, command, {}
     )
-    lines = repeat._train(one, (), scratch)
+    lines = repeat._train(one, scratch)
     assert (lines[0].recipe, lines[0].data_recipe) == (who.recipe, who.data)
     again = repeat.compare(
         replace(one, run=lines[0].config_hash, isa=lines[0].isa, numbers=numbers_of(lines)),
-        repeat._train(one, (), scratch),
+        repeat._train(one, scratch),
     )
     assert again.holds
     assert again.numbers > 20

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlgs.bench.record import provenance, say, show, write_record
@@ -41,7 +41,7 @@ class Recorded:
     isa: str | None
     commit: str | None
     command: tuple[str, ...]
-    """Arguments of `python -m vlgs.run`, without folders of this machine."""
+    """Arguments of `python -m vlgs.run`."""
     numbers: Numbers
 
 
@@ -95,13 +95,12 @@ def run_repeat(
         ValueError: If nothing can be repeated, or a run fails; what it said last is in the error.
     """
     header = provenance(seed, results=results.name, results_version=RESULTS_VERSION)
-    chosen = choose_runs(results, labels, bool(folders), seed)[:most]
+    chosen = choose_runs(results, labels, folders, seed)[:most]
     rows = []
     with tempfile.TemporaryDirectory(prefix="vlgs-repeat-") as scratch:
         for one in chosen:
             say(f"{one.benchmark}, {one.table}: {one.row}; {one.scene}, seed {one.seed}")
-            photographs = folders if one.command[0] != "data=synthetic" else ()
-            rows.append(compare(one, _train(one, photographs, Path(scratch))))
+            rows.append(compare(one, _train(one, Path(scratch))))
             write_record(out / "repeat.csv", rows, header)
     show(
         f"{sum(row.holds for row in rows)} of {len(rows)} hold",
@@ -112,7 +111,7 @@ def run_repeat(
 
 
 def choose_runs(
-    results: Path, labels: Sequence[str], photographs: bool, seed: int
+    results: Path, labels: Sequence[str], folders: Sequence[str], seed: int
 ) -> list[Recorded]:
     """One run of each table of each benchmark, no run twice while there are others.
 
@@ -131,9 +130,11 @@ def choose_runs(
     found = []
     for file in sorted(results.glob("*/benchmark.yaml")):
         benchmark = Benchmark.read(file)
-        if not photographs and benchmark.overrides[0] != "data=synthetic":
-            say(f"{benchmark.name} is left out: --override says where its photographs are")
-            continue
+        if benchmark.overrides[0] != "data=synthetic":
+            if not folders:
+                say(f"{benchmark.name} is left out: --override says where its photographs are")
+                continue
+            benchmark = replace(benchmark, overrides=(*benchmark.overrides, *folders))
         composer = Composer(benchmark, file.with_name("recipes.json"))
         for label in labels or tables:
             if (file.parent / f"{label}.csv").is_file():
@@ -172,9 +173,9 @@ def _runs_of(
                     )  # fmt: skip
 
 
-def _train(one: Recorded, folders: Sequence[str], scratch: Path) -> list[Line]:
+def _train(one: Recorded, scratch: Path) -> list[Line]:
     """Train a run in a folder that keeps traced scenes and fitted heads for the next, and nothing else."""
-    command = [sys.executable, "-m", "vlgs.run", *one.command, *folders]
+    command = [sys.executable, "-m", "vlgs.run", *one.command]
     command += ["pictures=false", "progress=false", f"results={scratch}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     paths = list(scratch.glob("runs/*/metrics.json"))
