@@ -1,6 +1,9 @@
 """Only `vlgs.ops` imports the compiled kernel. An extension module is nothing to import-linter."""
 
 import ast
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2] / "vlgs"
@@ -37,3 +40,14 @@ def test_nobody_else_imports_the_kernel():
     }
     assert found
     assert {name for name in found if not name.startswith("ops/")} == set()
+
+
+def test_a_checkout_without_kernels_says_how_to_make_them(tmp_path: Path):
+    (tmp_path / "vlgs" / "ops").mkdir(parents=True)
+    (tmp_path / "vlgs" / "__init__.py").touch()
+    shutil.copy(ROOT / "ops" / "__init__.py", tmp_path / "vlgs" / "ops")
+    # Without site-packages, or the installed kernels would be found.
+    command = [sys.executable, "-S", "-E", "-c", "import vlgs.ops"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("ImportError: vlgs: compiled kernels must be")

@@ -5,3 +5,12 @@ the type of a device to what computes the operation there. Another device is one
 operation's own (`vlgs.ops.device`). The definition that a kernel is checked against shares no code with it: `rasterize_reference`
 here, or a function in the tests that the docstring names.
 """
+
+from importlib.util import find_spec
+
+if (
+    find_spec("vlgs.ops._csrc") is None
+):  # a checkout that nobody installed, or one installed before the kernels moved
+    raise ImportError(
+        "vlgs: compiled kernels must be there, got none in vlgs/ops; python -m pip install -e . makes them"
+    )
