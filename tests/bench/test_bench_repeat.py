@@ -102,16 +102,18 @@ def test_what_differs_is_told_and_is_status_1(
     assert (table.same_id == (name != "config_hash")).all()
 
 
-def test_another_instruction_set_may_differ(committed: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("what", ["cpu", "isa"])
+def test_another_machine_may_differ(what: str, committed: Path, monkeypatch: pytest.MonkeyPatch):
     def change(metrics: dict[str, Any]) -> None:
         metrics["miou"] *= 1.01
-        metrics["machine"]["isa"] = "v4"
+        metrics["machine"][what] = "another"
 
     trained_again(committed, monkeypatch, change)
     status, table = repeated(committed)
     assert status == 0
     assert (table.differing == 1).all()
-    assert not table.same_isa.any()
+    assert table.largest.tolist() == pytest.approx([0.01 / 1.01] * 2, rel=1e-4)
+    assert not table.same_machine.any()
 
 
 def test_another_seed_chooses_others(committed: Path):
@@ -174,7 +176,13 @@ def test_a_run_that_is_trained_again_has_the_same_numbers(tmp_path: Path):
     lines = repeat._train(one, scratch)
     assert (lines[0].recipe, lines[0].data_recipe) == (who.recipe, who.data)
     again = repeat.compare(
-        replace(one, run=lines[0].config_hash, isa=lines[0].isa, numbers=numbers_of(lines)),
+        replace(
+            one,
+            run=lines[0].config_hash,
+            cpu=lines[0].cpu,
+            isa=lines[0].isa,
+            numbers=numbers_of(lines),
+        ),
         repeat._train(one, scratch),
     )
     assert again.holds

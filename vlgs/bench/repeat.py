@@ -60,17 +60,18 @@ class Repeated:
     recorded_cpu: str | None
     recorded_isa: str | None
     recorded_commit: str | None
-    same_isa: bool
+    same_machine: bool
+    """Whether CPU and instruction set are those of the recorded run; others act like another seed."""
     numbers: int
     """That are compared: all of a run but those of `MEASURED`."""
     differing: int
     largest: float
-    """Largest difference of a number, as a share of the recorded one."""
+    """Largest difference of a number, as a share of the larger of both."""
 
     @property
     def holds(self) -> bool:
-        """Whether the tables' promise is kept: the same id, and on the same instruction set the same numbers."""
-        return self.same_id and (self.differing == 0 or not self.same_isa)
+        """Whether the tables' promise is kept: the same id, and on such a machine the same numbers."""
+        return self.same_id and (self.differing == 0 or not self.same_machine)
 
 
 def run_repeat(
@@ -104,7 +105,7 @@ def run_repeat(
             write_record(out / "repeat.csv", rows, header)
     show(
         f"{sum(row.holds for row in rows)} of {len(rows)} hold",
-        ["table", "run", "numbers", "differing", "largest", "instruction set"],
+        ["table", "run", "numbers", "differing", "largest", "machine"],
         [_shown(row) for row in rows],
     )
     return rows
@@ -198,7 +199,7 @@ def compare(one: Recorded, lines: Sequence[Line]) -> Repeated:
         recorded_cpu=one.cpu,
         recorded_isa=one.isa,
         recorded_commit=one.commit,
-        same_isa=lines[0].isa == one.isa,
+        same_machine=(lines[0].cpu, lines[0].isa) == (one.cpu, one.isa),
         numbers=len(names),
         differing=sum(share > 0 for share in shares),
         largest=max(shares, default=0.0),
@@ -215,16 +216,16 @@ def numbers_of(lines: Iterable[Line]) -> Numbers:
 
 
 def _share(before: float, now: float) -> float:
-    """How far apart two numbers are, as a share of the first; infinite where one of them is missing."""
+    """How far apart two numbers are, as a share of the larger; infinite where one of them is missing."""
     if before == now:
         return 0.0
     if math.isnan(before) or math.isnan(now):
         return math.inf
-    return abs(now - before) / max(abs(before), sys.float_info.min)
+    return abs(now - before) / max(abs(before), abs(now))
 
 
 def _shown(row: Repeated) -> list[str]:
-    same = "the same" if row.same_isa else f"another than {row.recorded_isa}"
+    same = "the same" if row.same_machine else f"not {row.recorded_cpu}, {row.recorded_isa}"
     return [
         f"{row.benchmark}/{row.table}",
         row.run if row.same_id else f"{row.run}, another id now",
