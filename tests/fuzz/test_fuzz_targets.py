@@ -38,6 +38,6 @@ def test_what_is_honest_is_taken_unless_something_foreign_stands_beside_it(
     arguments: tuple[str, ...], strangers: Path
 ):
     check_command(arguments)
-    with pytest.raises(ValueError, match=r"query\._target_ must be one of vlgs\.query"):
+    with pytest.raises(ValueError, match=r"query\._target_ must be one of vlgs\.queries"):
         check_command((*arguments, "query._target_=evil_lab.strike"))
     assert not (strangers / targets.CANARY).exists()

@@ -4,7 +4,7 @@ import importlib
 import inspect
 import pkgutil
 
-AREAS = ("ops", "fields", "losses", "objectives", "geometry", "view_blend", "fusion", "gaussians", "heads", "query", "indicator", "gsplat")  # fmt: skip
+AREAS = ("ops", "fields", "losses", "objectives", "geometry", "view_blend", "fusion", "gaussians", "heads", "queries", "indicator", "gsplat")  # fmt: skip
 """What a loss is made of. Scores (`metrics`), files (`data`, `formats`) and protocols have no gradient; `training` only adds these up, as most objectives do."""
 
 NO_GRADIENT = {

@@ -64,7 +64,7 @@ def test_a_blended_view_weighs_lambda_times_similarity(tiny_scene: Scene):
     objective = module.step.setup.objectives["blended_view"]
     assert isinstance(objective, BlendedView)
     done = module.step.forward(0)
-    plan = objective.plan(done.seen)
+    plan = objective.plan(0, done.seen.pair, done.seen.targets)
     assert plan is not None
     assert plan.weight == 0.7 * module.views.similarity(*done.seen.pair)
     assert done.seen.log == {"blend_weight": plan.weight}

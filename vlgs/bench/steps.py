@@ -201,7 +201,7 @@ def _plan(module: VLGSModule, step: int) -> BlendPlan | None:
     first, second = module.views.sampler.pair(step)
     objective = module.step.setup.objectives["blended_view"]
     assert isinstance(objective, BlendedView)
-    return objective.plan(step, (module.views[first], module.views[second]))
+    return objective.plan(step, (first, second), (module.views[first], module.views[second]))
 
 
 def _detour(used: Camera, meant: Camera, first: Camera, second: Camera) -> float:

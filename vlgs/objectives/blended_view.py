@@ -6,6 +6,7 @@ from torch import Tensor
 from vlgs.objectives.between import BlendPlan, CamerasBetween, plan_blend
 from vlgs.objectives.language import Language
 from vlgs.objectives.objective import Objective, Setup, StepView
+from vlgs.objectives.targets import Target
 from vlgs.values import require_range
 from vlgs.view_blend import blend_targets
 
@@ -43,15 +44,17 @@ class BlendedView(Objective):
 
     def __call__(self, step: StepView) -> dict[str, Float[Tensor, ""]]:
         """One term, where there is a blended view and its weight counts."""
-        plan = self.plan(step)
+        plan = self.plan(step.step, step.pair, step.targets)
         if plan is None:
             return {}
         step.log["blend_weight"] = plan.weight
         return {"blended": self.loss(plan, step)}
 
-    def plan(self, step: StepView) -> BlendPlan | None:
+    def plan(
+        self, step: int, pair: tuple[int, int], targets: tuple[Target, Target]
+    ) -> BlendPlan | None:
         """The blended view of an iteration; None where there is none or its loss does not count."""
-        (first, second), pair, setup = step.targets, step.pair, self.setup
+        (first, second), setup = targets, self.setup
         if (
             pair[0] == pair[1]
             or not setup.blend.active
@@ -63,7 +66,7 @@ class BlendedView(Objective):
         if weight <= setup.blend_least:
             setup.counts.skip("blend_zero" if weight <= 0 else "blend_small")
             return None
-        k, between = self.between.at(step.step)
+        k, between = self.between.at(step)
         cameras = (first.view.camera, second.view.camera)
         return plan_blend(cameras, k, between, similarity, weight, setup.blend, setup.blend_reuse)
 
