@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from vlgs.config import check_targets
 from vlgs.known import CONF, contents, groups, join, near, options, place, renamed
 from vlgs.manual import describe
-from vlgs.targets import check_hydra, require_plugins
+from vlgs.targets import check_hydra, require_importable, require_plugins
 
 _MOST_ENTRIES = 10_000
 """Of a user's file of options; none of ours has a hundred."""
@@ -290,6 +290,7 @@ def _check_plugins(config: DictConfig, overrides: Sequence[Override]) -> None:
             raise ValueError(
                 f"config: plugins must be given on the command line, as plugins=[{package}], got {package} from a file"
             )
+    require_importable(given)
 
 
 def _check_folder(folder: Path) -> None:

@@ -71,7 +71,10 @@ def require_given(config: DictConfig) -> None:
 
 
 def check_targets(
-    config: DictConfig, name: str = "config", plugins: Sequence[str] | None = None
+    config: DictConfig,
+    name: str = "config",
+    plugins: Sequence[str] | None = None,
+    trust: str = targets.TRUST,
 ) -> None:
     """Refuse a configuration with keys that nothing reads, or that would construct something that is neither ours nor trusted.
 
@@ -79,6 +82,7 @@ def check_targets(
         config: Composed.
         name: Of the file in `conf` that it was composed from.
         plugins: Packages that are trusted; by default those that the configuration names, which must then come from a command line.
+        trust: How the command at hand is told to trust one, for errors.
 
     Raises:
         ValueError: Names the key, and what could have been meant or how to allow it.
@@ -97,7 +101,8 @@ def check_targets(
         raise ValueError(
             f"config: {key} must be a key that is read, got one that nothing reads{hint}"
         )
-    targets.check_targets(plain, plain.get("plugins", []) if plugins is None else plugins)
+    named = plain.get("plugins", []) if plugins is None else plugins
+    targets.check_targets(plain, named, trust)
 
 
 def _require_place(results: str) -> None:
@@ -172,20 +177,15 @@ def instantiate(config: Any, **arguments: Any) -> Any:
         OSError: Likewise.
     """
     from hydra.errors import InstantiationException
-    from hydra.utils import get_object, instantiate
+    from hydra.utils import instantiate
 
     plain = OmegaConf.to_container(config, resolve=True)
     for key, node in nodes(plain):
         if "_target_" in node:
             name, target = join(key, "_target_"), str(node["_target_"])
-            try:
-                if not is_ours(target):
-                    targets.require_home(name, target, get_object)
-                made = get_object(target)
-            except (ImportError, InstantiationException) as error:
-                raise ValueError(
-                    f"config: {name} must be there and installed, got {target}: {error}"
-                ) from error
+            if not is_ours(target):
+                targets.require_home(name, target, find)
+            made = find(target)
             given = dict(node) | (arguments if not key else {})
             _require_arguments(_who(config, key, target), made, given)
     try:
@@ -200,6 +200,24 @@ def instantiate(config: Any, **arguments: Any) -> Any:
                 f"config: {config._target_} must be installed, got no {package}"
             ) from error
         raise
+
+
+def find(target: str) -> Any:
+    """What a dotted name means, imported. The one of Hydra's interface would write three lines of its own before it raises.
+
+    Raises:
+        ValueError: If there is no such thing, or it cannot be imported; says why in a line.
+    """
+    from hydra._internal.utils import _locate
+
+    try:
+        return _locate(target)
+    except (ImportError, ValueError) as error:
+        cause = error.__cause__ or error
+        reason = visible(" ".join(f"{type(cause).__name__}: {cause}".split()))
+        raise ValueError(
+            f"config: {target} must be there and importable, got {reason:.300}"
+        ) from error
 
 
 def _require_arguments(who: str, made: Callable[..., Any], given: Mapping[str, Any]) -> None:

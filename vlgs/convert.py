@@ -1,10 +1,12 @@
 """From one format to another: `python -m vlgs.convert IN OUT`; see `--help`."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
 from vlgs.data.sparse import find_sparse, read_cameras, write_transforms
+from vlgs.data.sparse.model import SparseModel
 from vlgs.data.sparse.write import write_colmap
 from vlgs.formats import (
     FORMATS,
@@ -144,13 +146,28 @@ def _convert_autoencoder(source: Path, target: Path) -> list[str]:
 
 def _convert_cameras(source: Path, target: Path, name: str | None) -> list[str]:
     model = read_cameras(source)
+    beware = []
     if target.suffix == ".json":
-        write_transforms(target, model)
+        images = _images_of(source, model)
+        if images is None:
+            beware = ["beware: no photographs found; their paths are images/NAME, beside the file"]
+        beside = "images" if images is None else os.path.relpath(images, target.parent.resolve())
+        write_transforms(target, model, Path(beside).as_posix())
     elif name not in (None, *_COLMAP):
         raise ValueError(f"convert: cameras go to {' or '.join(_COLMAP)}, got --as {name}")
     else:
         write_colmap(target, model, text=name == "colmap-text")
-    return [f"{target}: {len(model.images)} images, {len(model.points)} points"]
+    return [f"{target}: {len(model.images)} images, {len(model.points)} points", *beware]
+
+
+def _images_of(source: Path, model: SparseModel) -> Path | None:
+    """The folder of a scene's photographs: beside its cameras, or beside the folders that COLMAP's files lie in."""
+    folder = (source if source.is_dir() else source.parent).resolve()
+    for above in (folder, *folder.parents[:2]):
+        for images in (above / "images", above):
+            if model.images and (images / model.images[0].name).is_file():
+                return images
+    return None
 
 
 if __name__ == "__main__":

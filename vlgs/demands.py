@@ -36,5 +36,7 @@ def unmet(options: Mapping[str, object]) -> Iterator[Demand]:
 
 
 def has(option: object, needed: str) -> bool:
-    """Whether an option, or all options of a class, have a property."""
+    """Whether an option, or all options of a class, or one of several parts with names, have a property."""
+    if isinstance(option, Mapping):
+        return any(has(part, needed) for part in option.values())
     return getattr(option, needed, False) is True

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from vlgs.config import instantiate
 from vlgs.demands import Demand, has, unmet
-from vlgs.identity import GIVEN_FILES, RunIdentity, given_folders, identity, run_id
+from vlgs.identity import GIVEN_FILES, RunIdentity, given_folders, identity, run_id, trained_id
 from vlgs.known import CONF, option, options
 from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.places import record
@@ -76,6 +76,8 @@ class Experiment:
     identity: RunIdentity
     run_id: Callable[[str], str]
     """Takes what stands for the content of the data."""
+    trained_id: Callable[[str], str]
+    """Likewise; see `vlgs.identity.trained_id`."""
 
     def read_scenes(self) -> Scenes:
         """The scene at every mask level that is wanted.
@@ -128,6 +130,7 @@ def construct(config: DictConfig) -> Experiment:
         record=record(config),
         identity=identity(config),
         run_id=partial(run_id, config),
+        trained_id=partial(trained_id, config),
     )
     chosen = {field.name: getattr(parts, field.name) for field in fields(Parts)}
     for key in ("augment", "levels", "method", "query"):
@@ -170,7 +173,7 @@ def _refusal(config: DictConfig, demand: Demand) -> str:
     else:
         each = _options(group)
         fitting = [name for name, said in each.items() if has(instantiate(said), demand.needed)]
-        target = str(config[group]._target_)
+        target = str(config[group].get("_target_", "terms of its own"))
         same = (name for name, said in each.items() if said == config[group])
         got = next(same, None) or option(group, target) or target
     return f"config: {group} must be {' or '.join(fitting)} with {demand.asker}{why}, got {got}"

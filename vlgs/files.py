@@ -38,9 +38,13 @@ def write_atomically(
             if durable:
                 os.fsync(file.fileno())
             temporary.replace(path)
-        except BaseException:
+        except BaseException as error:
             with suppress(OSError):
                 temporary.unlink()
+            if (
+                isinstance(error, OSError) and error.errno and not error.filename
+            ):  # as writing's own
+                raise OSError(error.errno, error.strerror or str(error), str(path)) from error
             raise
     if not durable:
         return

@@ -2,21 +2,27 @@
 
 import logging
 import resource
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.initialize import get_gh_backup, restore_gh_from_backup
 
 from vlgs.experiment import Experiment
 from vlgs.fields import Field, HasGaussians
 from vlgs.fields.cloud import write_point_cloud
 from vlgs.identity import RESULTS_VERSION
 from vlgs.known import option
+from vlgs.opened import open_run
 from vlgs.opened.files import write_field
-from vlgs.prepare import Prepared
+from vlgs.prepare import Prepared, text_encoder
 from vlgs.queries import Learning, TextEncoder
 from vlgs.report.answer import KeptAnswers
 from vlgs.report.evaluate import evaluate, prompts_of
-from vlgs.report.pictures import drawn, write_pictures
+from vlgs.report.pictures import OVERVIEW, drawn, write_pictures
 from vlgs.report.provenance import commit, machine
 from vlgs.report.results import write_metrics, write_queries
 from vlgs.report.timing import measure_fps
@@ -30,7 +36,11 @@ log = logging.getLogger(__name__)
 
 
 def report(
-    ready: Prepared, progress: Progress, workshop: Workshop, text: TextEncoder | None
+    ready: Prepared,
+    progress: Progress,
+    workshop: Workshop,
+    text: TextEncoder | None,
+    trained: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Evaluate the trained scene and write scores, pictures and point clouds. metrics.json is written last: it marks the run as finished.
 
@@ -39,6 +49,7 @@ def report(
         progress: Whose result is evaluated.
         workshop: That made it, in the folder of the run.
         text: Encodes words; None if there is nothing to ask.
+        trained: Metrics of the run that trained the models, if it was another.
 
     Returns:
         The content of metrics.json.
@@ -86,7 +97,7 @@ def report(
         "query": _query(experiment) if language else None,
         "train_seconds": sum(made.seconds for made in workshop.made.values()),
         "skips": all_skips(workshop.made.values()).report(),
-        "peak_rss_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "peak_rss_bytes": max(_peak_bytes(), trained.get("peak_rss_bytes") or 0),
         "ply_bytes": sum(path.stat().st_size for path in clouds) if clouds else None,
         "checkpoint_bytes": sum(made.checkpoint_bytes for made in workshop.kept),
         "seed": experiment.seed,
@@ -96,6 +107,7 @@ def report(
         "dataset": experiment.dataset,
         "scene": scene.name,
         "fingerprint": scene.fingerprint,
+        "training": ready.trained_id,
         "results_version": RESULTS_VERSION,
         "commit": commit(),
         "machine": machine(),
@@ -105,6 +117,56 @@ def report(
     _keep(folder, field, experiment.parts.trainer.iterations)
     write_queries(folder.queries, evaluation)
     return write_metrics(folder.metrics, evaluation, extra)
+
+
+def draw_missing(ready: Prepared, folder: RunFolder) -> bool:
+    """Draw the pictures of a finished run that has none, as `report` would have, from the model that it kept; no number changes.
+
+    Where the run keeps no model that can be opened, a warning says so and what to do.
+
+    Args:
+        ready: What the run was told.
+        folder: Of the run.
+
+    Returns:
+        Whether something was drawn: not where pictures are not wanted, are there, or would show no view.
+    """
+    experiment, scene = ready.experiment, ready.scene
+    if not experiment.pictures or (folder.renders / OVERVIEW).exists() or not drawn(scene):
+        return False
+    try:
+        if not folder.field.is_file():  # a checkpoint need not be all of the result
+            raise ValueError(f"{folder.field} must be there, got none")
+        field = _opened(folder, experiment.record["plugins"])
+        if not field.has_language:
+            scene = without_language(scene)
+        asked = questions_of(field, scene, experiment.query, text_encoder(experiment, scene))
+    except (ValueError, OSError) as error:
+        log.warning(
+            "pictures are not drawn: %s; without %s the same command reports the run again from its checkpoint, and draws them",
+            *(error, folder.metrics),
+        )
+        return False
+    query = asked.query if asked else experiment.query
+    write_pictures(folder.renders, field, scene, query, asked.prompts if asked else None)
+    return True
+
+
+def _opened(folder: RunFolder, plugins: Sequence[str]) -> Field:
+    """The field that a run kept."""
+    running = (
+        get_gh_backup()
+    )  # `open_run` composes options, which Hydra's program around a run does not allow
+    GlobalHydra.instance().clear()
+    try:
+        return open_run(folder.path, plugins=plugins).field
+    finally:
+        restore_gh_from_backup(running)
+
+
+def _peak_bytes() -> int:
+    """Most memory that this process ever held."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _query(experiment: Experiment) -> str:

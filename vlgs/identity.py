@@ -5,12 +5,14 @@ data and `RESULTS_VERSION`.
 
 - Of a class its option counts: the one file of `conf/<group>`, or of the folder of ``--config-dir``, that names the class. Classes
   can be moved and renamed. ``raster=fast`` and ``raster.transmittance_min=0.01`` are one run, since both files construct one class.
-- A class that stands in no such file, as in ``fusion._target_=my_lab.Gated``, counts by its path.
+- A class that stands in no such file, as in ``fusion._target_=my_lab.Gated``, counts by its path. One that is not ours counts by the
+  sources of its package, too: who edits ``my_lab`` and runs the same command again trains another run.
 - A part that is no group (``gaussians.densify``) counts by its values: only one class of ours can stand there.
 - Every value counts that is not in `MOVES_NOTHING`. Defaults count like values that are given, so that a default can change
   without two different runs sharing an id. 1 and 1.0 are the same.
 - A key that is new, or goes, changes no id where it has the value in `AS_WITHOUT`.
 - What stands at a key whose children a user names (`vlgs.known.OPEN`) counts by being there, too.
+- A defect that is mended changes the ids of the runs that it was in (`MENDED`), and no others.
 - A key that was renamed counts by its former name (`vlgs.known.FORMER`).
 
 Renaming an option does change ids: rows of results/ have to be carried over then.
@@ -18,7 +20,7 @@ Renaming an option does change ids: rows of results/ have to be carried over the
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from vlgs.known import OPEN, former, is_group, join, last, nodes, option, targets
+from vlgs.sources import sources_digest
 
 RESULTS_VERSION = 6
 """Part of every run id; raised by a change that can move a number."""
@@ -55,6 +58,9 @@ MOVES_NOTHING = frozenset(
 )
 """Keys that cannot move a number, with all that is below them. Switches of `vlgs.skips` are not among them, though some of them move
 no bit: what they move is the time that table `skips` compares."""
+
+AFTER_TRAINING = ("protocol", "query", "text")
+"""Groups that are asked for nothing before the last step: runs that differ in them alone have the same models."""
 
 PLACES = frozenset({"root", "labels", "features", "vocabulary", "release", "scene"})
 """Keys of `data` that say where a scene lies, or which one it is, but not how it is read."""
@@ -87,6 +93,27 @@ AS_WITHOUT: Mapping[str, Any] = {
 they have; the default may be another. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""
 
 
+def _prunes_large(counted: Mapping[str, Any]) -> bool:
+    """What a background starts with was pruned as large after the first reset of the opacities."""
+    densify = "gaussians.densify"
+    resets, prunes = counted.get(f"{densify}.reset_every"), counted.get(f"{densify}.prune_large")
+    return bool(resets and prunes)
+
+
+def _has_own_shape_and_decay(counted: Mapping[str, Any]) -> bool:
+    """Language's own shape had neither the decay of colour's nor its pace."""
+    decays = "trainer.color_decay" in counted or "trainer.rates_for" in counted
+    return decays and counted.get("sharing.covariances") is False
+
+
+MENDED: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
+    "mended.large_background": _prunes_large,
+    "mended.decay_of_copies": _has_own_shape_and_decay,
+}
+"""Name -> whether a configuration, by what counts of it, moved its numbers when a defect was mended. For what few runs have; what many have
+raises `RESULTS_VERSION`."""
+
+
 @dataclass(frozen=True)
 class RunIdentity:
     """A run as a table knows it, before any data is read: runs that differ in scene and seed only share a recipe."""
@@ -102,6 +129,14 @@ def run_id(config: DictConfig, fingerprint: str) -> str:
     """Hash of all that can move a number; `fingerprint` stands for the content of the data, wherever it lies."""
     plain = _plain(config)
     del plain["data"]
+    return _digest(_without_files(plain) | {"data": fingerprint})
+
+
+def trained_id(config: DictConfig, fingerprint: str) -> str:
+    """`run_id` without `AFTER_TRAINING`: equal where the models of two runs are, bit for bit."""
+    plain = _plain(config)
+    for key in ("data", *AFTER_TRAINING):
+        del plain[key]
     return _digest(_without_files(plain) | {"data": fingerprint})
 
 
@@ -152,7 +187,9 @@ def _counted(node: Any, key: str = "") -> dict[str, Any]:
     leaves = {former(k): v for k, v in _leaves(node, key)}
     if not key:
         leaves["loss"] = "default"  # as the group counted while one class held all terms
-    return {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
+    counted = {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
+    mended = {} if key else {name: True for name, had in MENDED.items() if had(counted)}
+    return counted | mended
 
 
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
@@ -173,6 +210,8 @@ def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
 def _class(key: str, target: str) -> Iterator[tuple[str, str | bool]]:
     """What a class counts by; nothing where no other class of ours can stand."""
     name = option(key, target, _own_folders())
+    if target not in targets(last(key)):
+        yield from _source(key, target)
     if key.rpartition(".")[0] in OPEN:
         yield key, True
         if target not in targets(last(key)):
@@ -181,6 +220,13 @@ def _class(key: str, target: str) -> Iterator[tuple[str, str | bool]]:
         yield key, name
     elif is_group(key) or target not in targets(last(key)):
         yield join(key, "_target_"), target
+
+
+def _source(key: str, target: str) -> Iterator[tuple[str, str]]:
+    """What a class of somebody else's package counts by beside its name: the sources of the package, where it has any."""
+    digest = sources_digest(target.partition(".")[0])
+    if digest is not None:
+        yield join(key, "_source_"), digest
 
 
 def _value(node: Any, key: str) -> Any:

@@ -37,13 +37,18 @@ def list_options(group: str) -> str:
 
 def _about(group: str, option: str) -> list[str]:
     """Comments of an option's file that stand on lines of their own."""
-    lines = (CONF / group / f"{option}.yaml").read_text().splitlines()
+    path = CONF / group / f"{option}.yaml"
+    if not path.is_file():
+        return ["An option of your own: its file has the keys."]
+    lines = path.read_text().splitlines()
     return [line[2:] for line in lines if line.startswith("# ") and "@package" not in line]
 
 
 def _keys(group: str, option: str) -> Iterator[tuple[str, tuple[str, str]]]:
     """Key -> value and comment, first those of the options that this one is made from."""
     path = CONF / group / f"{option}.yaml"
+    if not path.is_file():
+        return
     for entry in contents(path).get("defaults", []):
         if isinstance(entry, str) and entry != "_self_":
             yield from _keys(group, entry.partition("@")[0])

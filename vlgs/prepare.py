@@ -40,6 +40,8 @@ class Prepared:
     experiment: Experiment
     scenes: Scenes
     run_id: str
+    trained_id: str
+    """Equal where the models of two runs are (`vlgs.identity.trained_id`)."""
 
     @property
     def scene(self) -> Scene:
@@ -62,7 +64,7 @@ def prepare(experiment: Experiment) -> Prepared:
     torch.set_num_threads(experiment.threads)
     check_constants(experiment.parts.raster)
     scenes = experiment.read_scenes()
-    ready = Prepared(experiment, scenes, "")
+    ready = Prepared(experiment, scenes, "", "")
     _require_sizes(ready.scene)
     experiment.augment.require(scenes)
     if experiment.method is not None:
@@ -70,7 +72,10 @@ def prepare(experiment: Experiment) -> Prepared:
     read = [ready.fingerprint, experiment.augment.identity()]
     read += [file_digest(path, key) for key, path in experiment.given_files.items()]
     read += [folder_digest(path, key) for key, path in experiment.given_folders.items()]
-    return replace(ready, run_id=experiment.run_id(" ".join(filter(None, read))))
+    content = " ".join(filter(None, read))
+    return replace(
+        ready, run_id=experiment.run_id(content), trained_id=experiment.trained_id(content)
+    )
 
 
 def doubts(experiment: Experiment) -> Iterator[Fault]:

@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +35,12 @@ def main(config: DictConfig) -> None:
         tidy_sweep(Path(HydraConfig.get().sweep.dir))
     # In a multirun Hydra notes an error and goes on with the other runs; `command` says the first when all are done.
     with nullcontext() if several else _errors_in_a_line():
-        status = run(config)
+        try:
+            status = run(config)
+        finally:
+            if several:
+                with suppress(OSError):  # somebody put something there, or Hydra made none
+                    Path(HydraConfig.get().runtime.output_dir).rmdir()
     if status and not (several and status == UNSCORED):  # whose other runs go on
         sys.exit(status)
 
@@ -123,11 +128,12 @@ def _removed_if_refused(folder: RunFolder) -> Iterator[None]:
 def _run_in(folder: RunFolder, ready: "Prepared") -> int:
     finished = folder.finished()
     if finished is not None:
-        return _say(finished, folder, "already done, nothing computed")
+        return _say(finished, folder, _already_done(folder, ready))
     from vlgs.data.scene_warnings import plausibility_warnings
     from vlgs.finish import report
     from vlgs.opened.files import write_scene
     from vlgs.prepare import doubts, make_workshop, text_encoder
+    from vlgs.trained_before import take_training
     from vlgs.training.stages import run_stages
     from vlgs.training.workshop import StoppedError
 
@@ -138,13 +144,23 @@ def _run_in(folder: RunFolder, ready: "Prepared") -> int:
     text = text_encoder(experiment, scene)
     write_config(folder.config, experiment.record)
     write_scene(folder, scene, list(ready.scenes))
+    taken = take_training(folder, ready.trained_id)
     workshop = make_workshop(folder, ready)
     try:
         progress = run_stages(experiment.stages(), ready.scenes, workshop)
     except StoppedError as stop:
         log.warning("%s; the same command goes on from there:\n  %s", stop, _command())
         return STOPPED
-    return _say(report(ready, progress, workshop, text), folder)
+    return _say(report(ready, progress, workshop, text, taken or {}), folder)
+
+
+def _already_done(folder: RunFolder, ready: "Prepared") -> str:
+    """What is said of a finished run; its pictures are drawn if it was told to have none then, and is to have them now."""
+    from vlgs.finish import draw_missing
+
+    if draw_missing(ready, folder):
+        return "already done; its pictures were drawn now, nothing else computed"
+    return "already done, nothing computed"
 
 
 def _say(metrics: dict[str, Any], folder: RunFolder, first: str = "") -> int:

@@ -94,7 +94,7 @@ SKIPS: tuple[Skip, ...] = (
     Skip(
         "blend_reuse", "trainer.skip.blend_reuse", 0.01, 0.0, "off", "bounded",
         "the camera is off by at most blend_reuse * the distance and the angle between the two views",
-        "The blended view is not rendered where min(k, 1 - k) < blend_reuse: the real view's language stands for it.",
+        "The blended view is not rendered where min(k, 1 - k) < blend_reuse: the real view's language stands for it, for densification too.",
         "42 % of Beta(0.2, 0.2) lie within 0.01 of an end",
     ),
     Skip(
@@ -119,7 +119,7 @@ SKIPS: tuple[Skip, ...] = (
     ),
     _always(
         "unused_modality", "same bits",
-        "A blended view renders language alone; a scene or view without language renders colour alone, unfused.",
+        "A blended view renders language alone, a view without language its colour alone; a scene without language is not fused either.",
         "Eq. 12",
     ),
     _always(
@@ -141,6 +141,11 @@ SKIPS: tuple[Skip, ...] = (
         "known_runs", "same bits",
         "A run that exists is reported, not repeated (on_existing=resume).",
         "the run id hashes all that can move a number",
+    ),
+    _always(
+        "known_models", "same bits",
+        "Of a run that differs from a finished one in query, protocol or text alone the models are taken, not trained again.",
+        "nothing asks for these before the last step",
     ),
 )  # fmt: skip
 """In the order of the documentation: rasterizer, training, what has no switch."""

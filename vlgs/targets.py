@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from vlgs.known import join, last, nodes, targets
+from vlgs.sources import is_importable
 
 _NOT_PLUGINS = frozenset(sys.stdlib_module_names) | {
     *("vlgs", "torch", "lightning", "pytorch_lightning", "hydra", "hydra_plugins", "omegaconf"),
@@ -24,12 +25,17 @@ _HYDRAS = ("hydra_plugins.", "hydra._internal.core_plugins.")
 """Where Hydra's launchers and sweepers are."""
 
 
-def check_targets(config: Mapping[str, Any], plugins: object) -> None:
+TRUST = "plugins=[{}]"
+"""How the command line of a run says that it trusts a package."""
+
+
+def check_targets(config: Mapping[str, Any], plugins: object, trust: str = TRUST) -> None:
     """Refuse a configuration that would construct anything but our parts and those of trusted packages.
 
     Args:
         config: Plain and resolved, without Hydra's own part.
         plugins: Packages that the user trusts.
+        trust: How the command at hand is told to trust one, for errors.
 
     Raises:
         ValueError: Names the key, the target and, where there is one, the way to allow it.
@@ -42,7 +48,7 @@ def check_targets(config: Mapping[str, Any], plugins: object) -> None:
             if word or (name == "_partial_" and last(key) != "text"):
                 raise ValueError(f"config: {join(key, name)} must not be given, got {value!r}")
         if "_target_" in node:
-            _check(key, node["_target_"], trusted)
+            _check(key, node["_target_"], trusted, trust)
 
 
 def check_hydra(node: Mapping[str, Any]) -> None:
@@ -88,6 +94,19 @@ def require_plugins(plugins: object) -> Collection[str]:
     return plugins
 
 
+def require_importable(plugins: Collection[str]) -> None:
+    """Do nothing if every package is there; none is imported.
+
+    Raises:
+        ValueError: Names the first that is not.
+    """
+    for package in plugins:
+        if not is_importable(package):
+            raise ValueError(
+                f"plugins: {package} must be importable, from the current folder, PYTHONPATH or an installed package, got none of that name"
+            )
+
+
 def require_home(key: str, target: str, resolve: Callable[[str], Any]) -> None:
     """Refuse a target of a plugin that is not defined in its package, such as a function of a module that the package imports.
 
@@ -110,7 +129,7 @@ def require_home(key: str, target: str, resolve: Callable[[str], Any]) -> None:
         )
 
 
-def _check(key: str, target: object, trusted: Collection[str]) -> None:
+def _check(key: str, target: object, trusted: Collection[str], trust: str) -> None:
     allowed = targets(last(key))
     if isinstance(target, str) and target in allowed:
         return
@@ -122,7 +141,7 @@ def _check(key: str, target: object, trusted: Collection[str]) -> None:
     )
     advice = ""
     if _is_name(target) and package not in _NOT_PLUGINS:
-        advice = f"; if you trust it, add its package on the command line: plugins=[{package}]"
+        advice = f"; if you trust it, add its package on the command line: {trust.format(package)}"
     raise ValueError(f"config: {join(key, '_target_')} must be {choice}, got {target!r}{advice}")
 
 

@@ -37,7 +37,7 @@ class ObjectLabels:
     masks: Mapping[str, Bool[Tensor, "h w"]]
     """Category -> union of its instances."""
     boxes: Mapping[str, Float[Tensor, "b 4"]]
-    """Category -> one ``(x1, y1, x2, y2)`` per instance, in pixels, edges inclusive."""
+    """Category -> one ``(x1, y1, x2, y2)`` per instance, in pixels, edges inclusive; NaN: the view shows nothing of it."""
 
 
 @dataclass(frozen=True)

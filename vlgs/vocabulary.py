@@ -19,9 +19,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Read words, encode them, write them; exit status 1 and one message where that cannot be."""
     parser = argparse.ArgumentParser(prog="python -m vlgs.vocabulary", description=__doc__)
     parser.add_argument(
-        "words", type=Path, help="text file, a word or phrase a line; # starts a comment"
+        "words",
+        type=Path,
+        metavar="WORDS",
+        help="text file, a word or phrase a line; # starts a comment",
     )
-    parser.add_argument("out", type=Path, help="npz to write")
+    parser.add_argument("out", type=Path, metavar="OUT", help="npz to write")
     parser.add_argument(
         "--model",
         default=CLIP_MODEL,
@@ -39,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     args = parser.parse_args(arguments)
     try:
+        if args.out.suffix.lower() != ".npz" or args.out.is_dir():
+            raise ValueError(f"vocabulary: OUT must be a file that ends in .npz, got {args.out}")
         words = read_words(args.words)
         if not args.no_negatives:
             words += [word for word in CANONICAL_NEGATIVES if word not in words]

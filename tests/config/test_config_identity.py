@@ -24,6 +24,7 @@ from vlgs.identity import (
     identity,
     moves,
     run_id,
+    trained_id,
 )
 from vlgs.known import CONF, contents, groups, is_group, last, nodes, option, options, targets
 
@@ -60,8 +61,8 @@ NAMES = {
 IDS = {
     "data.scene=mirrors": ("cbb48f3055c16f1d", "fcbc1c6958b88ef0", "3c63531ff24cf4fc"),
     "levels=joint indicator=per_level fusion=none trainer=paper": (
-        "95fd7d65ceee6fc1",
-        "875e6f78ec568f58",
+        "cda3757fe9b527a0",
+        "3c2fbaea7010648d",
         "3c63531ff24cf4fc",
     ),
     "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2": (
@@ -167,6 +168,26 @@ def test_a_key_changes_no_id_where_it_has_the_value_that_is_as_without(key: str)
     assert ids(without) != want
 
 
+@pytest.mark.parametrize(
+    ("had", "clean"),
+    [
+        ("trainer=paper", "trainer=paper gaussians.densify.prune_large=false"),
+        ("trainer=paper", "trainer=default"),
+        ("sharing=pos trainer=fast", "sharing=pos_cov trainer=fast"),
+        ("sharing=pos trainer.rates_for=900", "sharing=pos trainer=default"),
+    ],
+)
+def test_a_mended_defect_moves_the_ids_of_the_runs_that_had_it(
+    had: str, clean: str, monkeypatch: pytest.MonkeyPatch
+):
+    moved, still = composed(*had.split()), composed(*clean.split())
+    now, same = ids(moved), ids(still)
+    monkeypatch.setattr("vlgs.identity.MENDED", {})
+    assert ids(moved)[0] != now[0]
+    assert ids(moved)[1] != now[1]
+    assert ids(still) == same
+
+
 def test_ids_stay():
     for overrides, want in IDS.items():
         config = composed(*overrides.split())
@@ -239,6 +260,18 @@ def test_what_the_command_line_puts_in_place_of_a_class_is_no_option_but_its_own
     assert not foreign & {named, ids(composed("fusion=self"))}
     inner = ids(composed("gaussians.densify._target_=my_lab.Densify"))
     assert inner != ids(composed())
+
+
+@pytest.mark.parametrize("given", ["query=vocab_softmax", "protocol=lerf_ovs", "text=clip"])
+def test_models_are_the_same_whatever_is_asked_or_scored(given: str):
+    assert trained_id(composed(given), "f") == trained_id(composed(), "f")
+    assert run_id(composed(given), "f") != run_id(composed(), "f")
+
+
+@pytest.mark.parametrize("given", ["seed=1", "fusion=none", "levels=joint", "method=langsplat", "trainer.iterations=7"])  # fmt: skip
+def test_models_are_others_whatever_else_is_said(given: str):
+    assert len({trained_id(composed(*words), "f") for words in ((), (given,))}) == 2
+    assert trained_id(composed(given), "g") != trained_id(composed(given), "f")
 
 
 def test_one_and_one_point_zero_are_one_run():

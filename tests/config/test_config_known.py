@@ -110,3 +110,7 @@ def test_what_other_values_are_made_of_must_be_given(given: list[str], missing: 
         config = compose("config", overrides=given)
     with pytest.raises(ValueError, match=rf"^config: {missing} must be given, as {missing}=VALUE;"):
         check_config(config)
+
+
+def test_an_option_of_ones_own_has_its_keys_in_its_own_file():
+    assert describe("fusion", "gated").splitlines()[0] == "fusion=gated"

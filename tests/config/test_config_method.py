@@ -100,6 +100,8 @@ def test_a_method_runs(chosen, tmp_path: Path):
         (["method=lifted", "fusion=self"], "fusion must be none with language that is lifted, as nothing trains it"),
         (["method=gs3d", "fusion=self"], "fusion must be none with a method of colour alone, as there is no language, got self"),
         (["method=gs3d", "indicator=learned"], "indicator must be fixed or opacity with a method of colour alone"),
+        (["method=langsplat", "blend=beta"], "loss must be default with a blended view, as no other .*, got langsplat$"),
+        (["method=langsplat", "indicator=learned"], "indicator must be fixed or opacity with a stage that freezes indicator_logits, as .*, got learned$"),
         (["method=goi", "head=autoencoder"], "head must be lookup with loss.lookup, as it learns the rows of a table, got autoencoder"),
         (["method=lerf", "augment=offline"], "augment must be none with a radiance field, as there are no Gaussians to render .*, got offline$"),
         (["method=opennerf", "levels=separate"], "levels must be single or joint with a radiance field, as there is one field .*, got separate$"),

@@ -214,6 +214,7 @@ def test_an_unknown_id_names_the_file(tmp_path: Path):
         ({}, "classes that count must be at least 1"),
         ({"0": {"name": "a", "ignore": True}}, "classes that count must be at least 1"),
         ({"x": {"name": "a"}}, "class id must be 0 to 254, got 'x'"),
+        ({"0": {"name": "a"}, "00": {"name": "b"}}, "class id must be 0 to 254, got '00'"),
         ({"255": {"name": "a"}}, "class id must be 0 to 254, got '255'"),
         ({"0": {"name": "a"}, "1": {"name": "a"}}, "class names must be unique"),
         ({"0": {}}, "class 0: name must be a word, got None"),

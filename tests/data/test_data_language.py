@@ -123,11 +123,12 @@ def test_half_a_pair_is_no_language_map(tmp_path: Path):
     assert find_mask_files(tmp_path, "a") is None
 
 
-@pytest.mark.parametrize("key", ["names", "classes"])
-def test_vocabulary_of_an_npz(tmp_path: Path, key: str):
-    path = tmp_path / "v.npz"
+@pytest.mark.parametrize(("key", "name"), [("names", "v.npz"), ("classes", "v.NPZ")])
+def test_vocabulary_of_an_npz(tmp_path: Path, key: str, name: str):
+    path = tmp_path / name
     words = {key: np.array(["cup", "tea in a glass"])}
-    np.savez(path, allow_pickle=False, **words, embeddings=7 * unit_rows(2))
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **words, embeddings=7 * unit_rows(2))
     vocabulary = read_vocabulary(path)
     assert vocabulary.names == ("cup", "tea in a glass")
     np.testing.assert_allclose(vocabulary.vectors.numpy(), unit_rows(2), atol=1e-6)

@@ -133,17 +133,39 @@ def test_shrinking_averages_areas():
 
 def test_boxes_follow_their_pixels():
     warp = make_lens(camera("PINHOLE", (60.0, 57.0, 33.0, 23.0)), SIZE, 0.5, "")
-    np.testing.assert_allclose(move_boxes(np.array([[4.0, 6, 20, 30]]), warp), [[2, 3, 10, 15]])
+    boxes = np.array([[4.0, 6, 20, 30], [20, 30, 4, 6]])
+    np.testing.assert_array_equal(move_boxes(boxes, SIZE, warp), [[2, 3, 9, 14]] * 2)
     bent = lens("OPENCV")
-    (moved,) = move_boxes(np.array([[10.0, 8, 40, 30]]), bent)
-    corners = bent.from_file(np.array([[10.0, 8], [40, 8], [40, 30], [10, 30]]))
-    assert (moved[:2] <= corners.min(axis=0)).all()
-    assert (moved[2:] >= corners.max(axis=0)).all()
+    (moved,) = move_boxes(np.array([[10.0, 8, 40, 30]]), SIZE, bent)
+    corners = bent.from_file(np.array([[10.0, 8], [41, 8], [41, 31], [10, 31]]))
+    assert (moved[:2] - 0.5 <= corners.min(axis=0)).all()
+    assert (moved[2:] + 1.5 >= corners.max(axis=0)).all()
+
+
+@pytest.mark.parametrize("resize", [1.0, 0.5, 0.25, 0.125])
+@pytest.mark.parametrize("finer", [1, 2])
+def test_a_box_holds_the_pixels_that_a_mask_of_it_has(resize: float, finer: int):
+    warp = make_lens(camera("PINHOLE", (60.0, 57.0, 33.0, 23.0)), SIZE, resize, "")
+    size = (SIZE[0] * finer, SIZE[1] * finer)
+    nearest = nearest_pixels(warp, size).numpy()
+    for x1, y1, x2, y2 in [
+        (3, 4, 20, 17),
+        (5.5, 6.2, 30.9, 31),
+        (10.2, 4, 10.8, 9),
+        (0, 0, 63, 47),
+    ]:
+        mask = np.zeros(size[::-1], bool)
+        mask[math.ceil(y1) : math.floor(y2) + 1, math.ceil(x1) : math.floor(x2) + 1] = True
+        (box,) = move_boxes(np.array([[x1, y1, x2, y2]], float), size, warp)
+        y, x = np.indices(nearest.shape)
+        inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
+        np.testing.assert_array_equal(inside, mask.ravel()[nearest])
 
 
 def test_a_box_that_the_lens_cannot_show_holds_no_pixel():
     barrel = make_lens(camera("SIMPLE_RADIAL", (60.0, 32.0, 24.0, -0.3)), SIZE, 1.0, "")
-    moved = move_boxes(np.array([[5000.0, 5000, 6000, 6000], [30, 20, 34, 28]]), barrel)
+    boxes = np.array([[5000.0, 5000, 6000, 6000], [30, 20, 34, 28]])
+    moved = move_boxes(boxes, SIZE, barrel)
     assert np.isnan(moved[0]).all()
     assert np.isfinite(moved[1]).all()
 

@@ -210,3 +210,45 @@ def test_the_fox_of_instant_ngp(shared: Path, tmp_path: Path):
     view = scene.train[0]
     assert abs(view.camera.width - 540) < 20
     assert view.read_image().shape[:2] == (view.camera.height, view.camera.width)
+
+
+def test_paths_lead_to_the_photographs_from_wherever_the_file_lies(tmp_path: Path):
+    root = tmp_path / "scene"
+    write_scene(root)
+    target = tmp_path / "elsewhere" / "deep" / "cameras.json"
+    target.parent.mkdir(parents=True)
+    assert not any(line.startswith("beware") for line in convert(root, target))
+    frames = json.loads(target.read_text())["frames"]
+    assert len(frames) > 1
+    for frame in frames:
+        assert (target.parent / frame["file_path"]).resolve().parent == (root / "images").resolve()
+        assert (target.parent / frame["file_path"]).is_file()
+    assert convert(root / "sparse" / "0", target)[1:] == []
+    assert json.loads(target.read_text())["frames"] == frames
+    (root / "images").rename(root / "gone")
+    assert any(line.startswith("beware: no photographs found") for line in convert(root, target))
+
+
+def test_points_of_something_else_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    root, target = tmp_path / "scene", tmp_path / "cameras.json"
+    write_scene(root)
+    points = tmp_path / "sparse_pc.ply"
+    points.write_bytes(b"mine")
+    with pytest.raises(ValueError, match=r"sparse_pc\.ply beside it must not be there"):
+        convert(root, target)
+    assert points.read_bytes() == b"mine"
+    assert not target.exists()
+    points.unlink()
+
+    def full(path: Path, data: bytes) -> None:
+        if path == target:
+            raise OSError(28, "No space left on device", str(path))
+        path.write_bytes(data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("vlgs.data.sparse.transforms.write_atomically", full)
+        with pytest.raises(OSError, match="No space"):
+            convert(root, target)
+    assert not points.exists()
+    convert(root, target)
+    convert(root, target)  # its own

@@ -17,7 +17,13 @@ _WRITTEN = ("results/runs", "results/logs", "results/cache", "results/multirun")
 """Folders that runs write; they are not part of the repository."""
 _FOREIGN = ("preprocess.py", "autoencoder", "eval/evaluate_iou_loc.py", "scene/cameras.py")
 """Files of LangSplat's repository."""
-_EXAMPLES = ("my_lab/gated.py", "my_conf/fusion/gated.yaml", "breakfast.yaml", "F.md")
+_EXAMPLES = (
+    "my_lab/gated.py",
+    "my_conf/fusion/gated.yaml",
+    "breakfast.yaml",
+    "my_table.yaml",
+    "F.md",
+)
 """Files of a reader."""
 
 _FILE = re.compile(r"(?<![\w/.<>*{}$~@%-])(?:[\w.-]+/)*\w[\w.-]*\.(?:md|py|yaml|cpp|h)\b(?![\w(])")

@@ -16,7 +16,7 @@ from two_balls import HOSTILE, THINGS, opened_scene, unfinished
 
 from vlgs.export import Wanted, export
 from vlgs.export.__main__ import main
-from vlgs.export.content import Content, most_important
+from vlgs.export.content import Content, drawn, most_important
 from vlgs.export.packed import pack
 from vlgs.fields import PointCloud
 from vlgs.fields.planes import PlaneField
@@ -149,6 +149,14 @@ def test_only_what_answers_is_selected(opened: OpenedRun, tmp_path: Path):
     assert means.equal(opened.field.model.splats["means"][chosen])  # type: ignore[attr-defined]
     assert 140 < len(means) <= 160
     assert (means[:, 0] > 0).all()
+
+
+def test_what_nothing_draws_is_left_out_and_counted():
+    params = {"means": torch.eye(3), "opacity_logits": torch.tensor([-20.0, 0, 3])}
+    kept = drawn(Content(PointCloud(params, ())))
+    assert kept.cloud.params["means"].equal(torch.eye(3)[1:])
+    assert kept.notes == ["1 of 3 Gaussians left out, which nothing draws"]
+    assert drawn(kept).notes == kept.notes
 
 
 def test_most_keeps_what_is_large_opaque_and_near(opened: OpenedRun):

@@ -95,6 +95,8 @@ def test_dense_maps_that_cannot_be_are_refused(tmp_path: Path):
     maps = DenseMaps(str(tmp_path))
     with pytest.raises(FileNotFoundError, match=r"a\.npy must be the feature map of photograph a"):
         maps(noise(), [], "a")
+    with pytest.raises(FileNotFoundError, match=r"a\{x\}\.npy must be the feature map"):
+        DenseMaps(str(tmp_path), pattern="{stem}{x}.npy")(noise(), [], "a")
     np.save(tmp_path / "a.npy", np.zeros((3, 4)))
     with pytest.raises(ValueError, match=r"must be floats \[h, w, c\], got float64 \[3, 4\]"):
         maps(noise(), [], "a")

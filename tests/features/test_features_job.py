@@ -192,6 +192,16 @@ def test_a_dry_run_writes_nothing(scene: Path, weights: Path):
     assert "hf download facebook/sam-vit-huge" in lines[2]
 
 
+def test_a_scene_whose_maps_were_never_made_is_one_without_language(scene: Path, weights: Path):
+    (scene / "maps").mkdir()
+    dense = ("features/encoder=maps", f"features.extractor.encoder.folder={scene / 'maps'}")
+    with pytest.raises(FileNotFoundError, match="must be the feature map of photograph"):
+        extract(config(scene, None, *QUICK, *dense))
+    assert [path.name for path in (scene / "language_features").iterdir()] == ["features.json"]
+    assert len(load_scene(str(scene)).mask_vectors) == 0
+    extract(config(scene, weights, "features.out=" + str(scene / "others"), *QUICK))
+
+
 def test_missing_weights_are_one_error_with_all_of_them(scene: Path):
     with pytest.raises(FileNotFoundError, match="hf download facebook/sam-vit-huge") as e:
         extract(config(scene, scene))
@@ -254,6 +264,11 @@ def test_words_get_vectors_in_the_space_of_the_masks(
     with pytest.raises(SystemExit, match="words must be unique, got kettle more than once"):
         vocabulary.main([str(words), str(out), "--model", model])
     words.write_text("kettle")
+    for out in (words, tmp_path / "vocabulary.txt", tmp_path / "vocabulary"):
+        with pytest.raises(SystemExit, match=r"OUT must be a file that ends in \.npz"):
+            vocabulary.main([str(words), str(out), "--model", model])
+    assert words.read_text() == "kettle"
+    out = tmp_path / "deep" / "vocabulary.npz"
     with pytest.raises(SystemExit, match="weights must be on this machine"):
         vocabulary.main([str(words), str(out), "--model", str(tmp_path / "none")])
 

@@ -195,3 +195,9 @@ def test_faults_of_language_folders(tmp_path: Path):
     (tmp_path / "a_f.npy").unlink()
     with pytest.raises(FileNotFoundError, match="got a of it"):
         compress_language(tmp_path, tmp_path / "out", head)
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    write_view(tmp_path / "out", "b")
+    write_view(tmp_path, "a")
+    with pytest.raises(ValueError, match="OUT must be a new or empty folder"):
+        compress_language(tmp_path, tmp_path / "out", head)

@@ -305,6 +305,12 @@ def test_broken_rows_are_counted_and_refused_or_dropped(tmp_path: Path):
     assert got.dropped == {
         "means must be finite": 1, "log_scales must be finite": 3, "quats must not be zero": 1,
     }  # fmt: skip
+    huge = struct.pack("<6f8B", 1, 2, 3, 1e30, 1, 1, 9, 9, 9, 9, 255, 128, 128, 128)
+    (tmp_path / "h.splat").write_bytes(whole + huge)
+    with pytest.raises(
+        ValueError, match=r"h\.splat: log_scales must be at most 40, got 1 of 2 rows"
+    ):
+        read_gaussians(tmp_path / "h.splat")
     (tmp_path / "b.splat").write_bytes(whole + b"more")
     with pytest.raises(
         ValueError, match=r"must be rows of 32 bytes, got 36 bytes, 4 too many at byte 32"

@@ -171,8 +171,10 @@ def attacks(folder: Path, seed: int, count: int) -> Iterator[Attack]:
 
 
 def write_strangers(folder: Path) -> None:
-    """Files of somebody else, and a package that leaves a canary when it is imported or called."""
+    """Files of somebody else, a package that leaves a canary when it is imported or called, and an honest one that is only there."""
     (folder / "evil_lab").mkdir(parents=True)
+    (folder / "my_lab").mkdir()
+    (folder / "my_lab" / "__init__.py").touch()
     strike = f"open({str(folder / CANARY)!r}, 'w').close()\n"
     code = f"{strike}def strike(*a, **k):\n    {strike}"
     (folder / "evil_lab" / "__init__.py").write_text(code)

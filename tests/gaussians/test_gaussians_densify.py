@@ -185,6 +185,22 @@ def test_a_background_may_be_large():
     assert params["means"].norm(dim=1).min() > 8
 
 
+@pytest.mark.parametrize("distance", [1.1, 2.0, 3.9])
+def test_what_a_background_starts_with_is_not_large(distance: float):
+    """Neighbours of 1 500 directions touch: 0.092 of the distance (`vlgs.gaussians.background`)."""
+    params = make(40, 0.092 * distance * EXTENT)
+    with torch.no_grad():
+        directions = torch.nn.functional.normalize(params["means"], dim=1)
+        params["means"][:20] = distance * EXTENT * directions[:20]
+        params["means"][20:] = 0.9 * EXTENT * directions[20:]
+        params["log_scales"][20:] = math.log(0.101 * EXTENT)
+    centers = 0.9 * EXTENT * torch.cat([torch.eye(3), -torch.eye(3)])
+    state = state_of([COLD] * 40)
+    report = densify(params, adam(params), state, GaussiansConfig(), EXTENT, 0, LATE, centers)
+    assert report.pruned == 20  # those within the cameras, as 3DGS has it
+    assert params["means"].norm(dim=1).min() > EXTENT
+
+
 @pytest.mark.parametrize("name", PARAMETERS)
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 def test_broken_gaussians_are_removed(name: str, poison: float):
@@ -220,7 +236,7 @@ def test_highest_gradients_go_first_when_room_is_short():
     params = make(20)
     grads = [HOT * (1 + i) for i in range(20)]
     report = run(params, state_of(grads), GaussiansConfig(max_count=23))
-    assert report == DensifyReport(3, 0, 0, 23)
+    assert report == DensifyReport(3, 0, 0, 23, refused=17)
     assert torch.equal(params["means"][20:], params["means"][17:20])
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -104,7 +105,6 @@ def test_a_path_at_fault_is_one_error(
 
 
 def test_cameras_of_colmap_and_of_transforms(tmp_path: Path, opened: OpenedRun):
-    import numpy as np
 
     pose = pose_matrix(torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2.0, 3.0]).double())
     camera = SparseCamera(1, "PINHOLE", 48, 36, (40.0, 41.0, 23.0, 19.0))
@@ -121,6 +121,27 @@ def test_cameras_of_colmap_and_of_transforms(tmp_path: Path, opened: OpenedRun):
         torch.testing.assert_close(camera_center(got.viewmat), torch.tensor([1.0, 2.0, 3.0]))
         assert got.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == [40.0, 41.0, 23.0, 19.0]
         assert (got.width, got.height) == (48, 36)
+
+
+def test_images_of_one_stem_keep_apart(opened: OpenedRun, tmp_path: Path):
+    lens = SparseCamera(1, "PINHOLE", 48, 36, (40.0, 41.0, 23.0, 19.0))
+    names = ("left/1.jpg", "right/1.jpg", "right/2.jpg")
+    images = tuple(
+        SparseImage(i + 1, 1, name, (1.0, 0, 0, 0), (-1.0, -2.0, -3.0), observations=-1)
+        for i, name in enumerate(names)
+    )
+    nothing = np.zeros((0, 3))
+    model = SparseModel(tmp_path, "made", (lens,), images, np.zeros(0, int), nothing, nothing.astype(np.uint8))  # fmt: skip
+    write_transforms(tmp_path / "transforms.json", model)
+    frames = cameras_of(opened, str(tmp_path / "transforms.json")).frames
+    assert len({frame.name for frame in frames}) == 3
+    assert frames[-1].name == "2"
+
+
+@pytest.mark.parametrize("which", ["", " "])
+def test_no_name_is_no_camera(opened: OpenedRun, which: str):
+    with pytest.raises(ValueError, match="cameras: must be train, test, orbit"):
+        cameras_of(opened, which)
 
 
 def test_cameras_of_the_run_by_name_and_what_is_none(opened: OpenedRun):

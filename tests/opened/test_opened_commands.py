@@ -98,6 +98,13 @@ def test_a_question_that_cannot_be_is_one_line(
     assert "\n" not in str(stopped.value.code)
 
 
+@pytest.mark.parametrize("formats", ["", ",", "gif"])
+def test_a_format_that_is_none_is_one_line(finished: Path, formats: str, tmp_path: Path):
+    with pytest.raises(SystemExit, match="render: format must be one of png"):
+        render([str(finished), "--format", formats, "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
 def test_numbers_and_pictures_of_every_output(finished: Path, opened: OpenedRun, tmp_path: Path):
     outputs = "color,alpha,depth,language,relevancy:mug"
     render([str(finished), "--outputs", outputs, "--format", "png,npy", "--out", str(tmp_path)])

@@ -2,27 +2,33 @@
 
 import json
 import shutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
 from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 from torch import Tensor
 
+from vlgs.export.__main__ import main as export
 from vlgs.fields import Field
 from vlgs.fields.planes import Plane, with_planes
 from vlgs.fields.several import SeveralFields
 from vlgs.heads.classifier import Classifier
 from vlgs.opened import OpenedRun, open_run
 from vlgs.opened.files import write_field
+from vlgs.query import main as query
+from vlgs.render.__main__ import main as render
 from vlgs.run import run
 from vlgs.runs import RunFolder
 from vlgs.training.checkpoint import Checkpoint, decode, encode
 from vlgs.types import Scene
+from vlgs.view.__main__ import main as view
 
 FORM = "vlgs-field-1"
 
@@ -142,6 +148,96 @@ def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path):
     run_folder.config.write_text("fusion: {_target_: os.system}\n")
     with pytest.raises(ValueError, match="config"):
         open_run(folder)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "words\n", "{", "[1]", "fusion: 3\n", "fusion: [a\n", "a: &x [*x]\n"),
+        *("data: {_target_: 3}\n", "fusion: {_target_: vlgs.fusion.gone.Gone}\n"),
+    ],
+)
+def test_a_configuration_that_is_none_is_one_line_with_its_file(folder: Path, text: str):
+    RunFolder(folder).config.write_text(text)
+    with pytest.raises(ValueError, match=r"runs/\w+/config\.yaml: ") as said:
+        open_run(folder)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"query": None}, "got none of query"),
+        ({"text": None}, "got none of text"),
+        ({"query": {"_target_": "vlgs.queries.Relevancy"}}, "query._target_ must be a class"),
+        ({"query": {"temperature": "hot"}}, "query: temperature must be a finite number"),
+    ],
+)
+def test_a_value_that_cannot_be_is_told_with_its_file(
+    folder: Path, changed: dict[str, Any], message: str
+):
+    file = RunFolder(folder).config
+    content = yaml.safe_load(file.read_text())
+    for key, value in changed.items():
+        content[key] = {**content[key], **value} if value else value
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(ValueError, match=rf"runs/\w+/config\.yaml: .*{message}"):
+        open_run(folder)
+
+
+LAB = """from vlgs.fusion.attention import SelfAttention
+
+
+class Same(SelfAttention):
+    pass
+"""
+
+
+@pytest.fixture
+def owned(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A run with a fusion of a package of one's own."""
+    (folder.parent / "my_lab.py").write_text(LAB)
+    monkeypatch.syspath_prepend(folder.parent)
+    config = RunFolder(folder).config
+    text = config.read_text()
+    assert "vlgs.fusion.attention.SelfAttention" in text
+    config.write_text(text.replace("vlgs.fusion.attention.SelfAttention", "my_lab.Same"))
+    rewrite(folder, lambda plan, _: plan.update(fusion="my_lab.Same"))
+    yield folder
+    sys.modules.pop("my_lab", None)
+
+
+def test_a_part_of_ones_own_is_made_where_the_command_line_trusts_its_package(
+    owned: Path, opened: OpenedRun
+):
+    config = RunFolder(owned).config
+    config.write_text(config.read_text().replace("plugins: []", "plugins: [my_lab]"))
+    with pytest.raises(ValueError, match=r"fusion\._target_ must be .*: --plugins my_lab$"):
+        open_run(owned)  # the file's word is nobody's
+    assert "my_lab" not in sys.modules
+    with pytest.raises(ValueError, match="plugins: no_lab must be importable, from the current"):
+        open_run(owned, plugins=["no_lab"])
+    with pytest.raises(ValueError, match=r"plugins must be packages of your own.*got 'os'"):
+        open_run(owned, plugins=["os"])
+    back, camera = open_run(owned, plugins=["my_lab"]).field, opened.cameras()[0].camera
+    one, other = (field.render(camera, frozenset({"color"})) for field in (back, opened.field))
+    assert one.color is not None
+    assert other.color is not None
+    assert torch.equal(one.color, other.color)
+
+
+@pytest.mark.parametrize(
+    ("name", "main"), [("query", query), ("render", render), ("export", export), ("view", view)]
+)
+def test_every_command_takes_packages_that_it_may_trust(
+    name: str, main: Callable[[list[str]], None], owned: Path, tmp_path: Path
+):
+    words = {"query": ["mug", "--no-pictures"], "render": ["--out", str(tmp_path / "r")]}
+    words |= {"export": [str(tmp_path / "o.ply")], "view": ["--picture", str(tmp_path / "v.png")]}
+    given = [str(owned), *words[name]]
+    with pytest.raises(SystemExit, match=r"--plugins my_lab$"):
+        main(given)
+    main([*given, "--plugins", "my_lab"])
 
 
 def set_kind(plan: dict[str, Any], tensors: dict[str, Tensor]) -> None:

@@ -15,7 +15,7 @@ from vlgs.report import colors
 from vlgs.report.draw import Painter
 from vlgs.report.evaluate import prompts_of
 from vlgs.report.features import fit_feature_colors, paint_features
-from vlgs.report.overview import count_difference
+from vlgs.report.overview import count_difference, write_histogram
 from vlgs.report.pictures import PictureLimits, spread, write_pictures
 from vlgs.types import IGNORE_ID, Scene
 
@@ -104,6 +104,14 @@ def test_histogram_has_area_one():
     assert not count_difference(torch.zeros(0), torch.zeros(0)).any()
 
 
+def test_the_histogram_stands_alone_with_whole_labels(tmp_path: Path):
+    write_histogram(tmp_path / "h.png", count_difference(torch.rand(99), torch.rand(99)))
+    with Image.open(tmp_path / "h.png") as picture:
+        pixels = np.asarray(picture.convert("L"))
+    edges = (pixels[:, :5], pixels[:, -5:], pixels[:5], pixels[-5:])
+    assert all((edge == 255).all() for edge in edges)  # "-1.0" was cut at the left
+
+
 def test_views_are_spread_over_all():
     assert spread(range(10), 4) == [0, 2, 5, 7]
     assert spread(range(3), 8) == [0, 1, 2]
@@ -158,6 +166,21 @@ def test_scene_without_words_still_has_colour_features_and_indicator(tmp_path: P
         "photograph", "render", "features", "indicator_minus_opacity",
     }  # fmt: skip
     assert (tmp_path / "overview.png").is_file()
+
+
+def test_an_indicator_that_is_opacity_has_no_difference_to_show(tmp_path: Path):
+    class Equal(FakeField):
+        def language_weights(self) -> torch.Tensor:
+            return self.opacities().clone()
+
+    widths = []
+    for field in (FakeField(), Equal()):
+        overview = write_pictures(tmp_path / type(field).__name__, field, scene(1), QUERY, None)
+        assert overview is not None
+        with Image.open(overview) as sheet:
+            widths.append(sheet.width)
+    assert not list((tmp_path / "Equal").rglob("indicator_minus_opacity.png"))
+    assert widths[1] < widths[0] - 400  # without a column of 2.2 inches
 
 
 def test_views_with_and_without_labels_share_a_sheet(tmp_path: Path):

@@ -3,9 +3,11 @@
 import io
 import json
 import math
+import re
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -99,6 +101,33 @@ def test_summary_shows_scores_reasons_and_unbroken_paths(tmp_path: Path):
     ]
 
 
+def printed(metrics: dict[str, Any], **paths: Path) -> list[str]:
+    """Lines of a summary, without the space around them."""
+    stream = io.StringIO()
+    print_summary(metrics, paths, Console(file=stream, width=120))
+    return [line.strip() for line in stream.getvalue().splitlines()]
+
+
+def test_classes_stand_under_the_mean_of_them(tmp_path: Path):
+    written = write_metrics(tmp_path / "m.json", EVALUATION, {"fps_query": 2.7})
+    names = [re.split("  +", line)[0] for line in printed(written)]
+    first = names.index("IoU of each class")
+    assert names[first - 1 : first + 4] == [
+        *("other", "IoU of each class", "wine glass", "absent", "localisation accuracy"),
+    ]
+
+
+def test_what_nothing_was_scored_by_is_not_said(tmp_path: Path):
+    why = "the field has no language"
+    colour = replace(
+        EVALUATION, miou=None, per_category={}, beside={}, reasons={"miou": why, "loc_acc": why}
+    )
+    lines = printed(write_metrics(tmp_path / "m.json", colour, {}))
+    assert [line for line in lines if why in line] == [f"miou, loc_acc: {why}"]
+    assert not any("protocol" in line for line in lines)
+    assert "protocol: dense@1/synthetic" in printed(write_metrics(tmp_path / "n.json", EVALUATION, {}))  # fmt: skip
+
+
 def test_summary_says_what_was_skipped(tmp_path: Path):
     skips = {
         "blend_zero": {"skipped": 1500, "share": 0.25, "seconds_saved": 12.34},
@@ -179,17 +208,13 @@ def test_machine_is_described(tmp_path: Path):
 
 
 def test_the_summary_says_that_evaluated_views_were_trained_on():
-    def printed(seen: int) -> str:
-        stream = io.StringIO()
-        console = Console(file=stream, width=120)
-        metrics = {"protocol": "p", "reasons": {}, "test_views": 4, "test_views_seen": seen}
-        print_summary(metrics, {}, console)
-        return stream.getvalue()
+    def said(seen: int) -> str:
+        return "\n".join(printed({"reasons": {}, "test_views": 4, "test_views_seen": seen}))
 
-    assert "3 of 4 evaluated views were trained on: these are not held-out scores" in printed(3)
-    assert "evaluated views " in printed(3)
-    assert "trained on" not in printed(0)
-    assert "held-out views" in printed(0)
+    assert "3 of 4 evaluated views were trained on: these are not held-out scores" in said(3)
+    assert "evaluated views" in said(3).splitlines()[1]
+    assert "trained on" not in said(0)
+    assert "held-out views" in said(0)
 
 
 def test_names_of_strangers_are_printed_as_they_are(tmp_path: Path):

@@ -3,17 +3,20 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from colmap_scenes import pycolmap, write_scene
+from colmap_scenes import pycolmap, write_model, write_scene
 from plyfile import PlyData, PlyElement
 from safetensors.torch import load_file
 from tiny_runs import TINY, composed
 
 from vlgs.convert import convert, main
+from vlgs.data.sparse import read_cameras
+from vlgs.data.sparse.write import write_colmap
 from vlgs.formats import write_autoencoder
 from vlgs.gaussians import STANDARD, read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN
@@ -128,6 +131,42 @@ def test_colmap_to_colmap_keeps_tracks(tmp_path: Path):
             xy = [p.xy for p in image.points2D]
             assert np.array_equal(xy, [p.xy for p in models[0].images[number].points2D])
             assert image.cam_from_world() == models[0].images[number].cam_from_world()
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text"])
+def test_names_with_blanks_stay_whole(tmp_path: Path, form: str):
+    names = ["my photo 1.png", "two  blanks.png", "sub folder/line\u2028end.png"]
+    write_model(tmp_path / "text", names, text=True)
+    convert(tmp_path / "text", tmp_path / "out", form)
+    assert sorted(image.name for image in read_cameras(tmp_path / "out").images) == sorted(names)
+
+
+def test_images_that_colmap_reads_otherwise_are_refused(tmp_path: Path):
+    write_model(tmp_path / "text", ["a.png", "b.png"], text=True)
+    read = replace(model := read_cameras(tmp_path / "text"), images=model.images[:1])
+    with pytest.raises(ValueError, match=r"must hold 1 images and 6 points .* got 2 and 6"):
+        write_colmap(tmp_path / "out", read)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("form", "file"), [("colmap", "images.bin"), ("colmap-text", "rigs.txt")])
+def test_a_model_that_is_not_written_whole_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, file: str
+):
+    """As on a full disk, of which COLMAP's writer says nothing."""
+    write_scene(tmp_path / "scene", n=3)
+    name = "write_text" if form == "colmap-text" else "write"
+    write = getattr(pycolmap.Reconstruction, name)
+
+    def cut(self: object, folder: str) -> None:
+        write(self, folder)
+        path = Path(folder, file)
+        path.write_bytes(path.read_bytes()[:-3])
+
+    monkeypatch.setattr(pycolmap.Reconstruction, name, cut)
+    with pytest.raises(OSError, match=rf"{tmp_path / 'out'} must hold 1 cameras, 3 images and 6 p"):
+        convert(tmp_path / "scene", tmp_path / "out", form)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
 def test_tracks_of_no_image_are_one_line_and_leave_nothing(tmp_path: Path):

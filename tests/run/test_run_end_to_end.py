@@ -28,6 +28,12 @@ def only_run(results: Path) -> RunFolder:
     return RunFolder(path)
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """File -> its bytes."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results folder with one finished run of the full model."""
@@ -90,6 +96,23 @@ def test_a_finished_run_is_reported_not_repeated(
     assert run(composed(*SHORT, f"results={finished}", "threads=1", "pictures=false")) == 0
     assert "PSNR" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_a_finished_run_without_pictures_is_given_them(finished: Path, tmp_path: Path):
+    shutil.copytree(finished, tmp_path / "copy")
+    folder, given = only_run(tmp_path / "copy"), (*SHORT, f"results={tmp_path / 'copy'}")
+    metrics, want = folder.metrics.read_bytes(), contents(folder.renders)
+    shutil.rmtree(folder.renders)
+    assert run(composed(*given, "pictures=false")) == 0
+    assert not folder.renders.exists()
+    said = in_process("run", given)
+    assert "its pictures were drawn now, nothing else computed" in said.text
+    assert contents(folder.renders) == want
+    assert folder.metrics.read_bytes() == metrics
+    shutil.rmtree(folder.renders)
+    folder.field.unlink()
+    said = in_process("run", given)
+    assert f"pictures are not drawn: {folder.field} must be there, got none" in said.text
 
 
 def test_a_run_without_the_scores_that_were_asked_for_fails(finished: Path, tmp_path: Path):
@@ -254,7 +277,7 @@ def test_a_multirun_makes_one_run_per_combination(tmp_path: Path, monkeypatch: p
     assert len(folders) == 2
     assert all(folder.finished() for folder in folders)
     assert not list(empty.iterdir()), "a sweep must leave nothing where it was started"
-    assert (tmp_path / "multirun" / "multirun.yaml").is_file()
+    assert [path.name for path in (tmp_path / "multirun").iterdir()] == ["multirun.yaml"]
     for path in tmp_path.rglob("*"):
         content = path.read_bytes() if path.is_file() else b""
         for place in (tmp_path, CONF.parent, Path.home()):

@@ -12,6 +12,7 @@ from tiny_runs import TINY, composed
 from tests.fuzz.commands import command
 from vlgs.run import run
 from vlgs.runs import RunFolder
+from vlgs.sources import sources_digest
 
 SHORT = (
     *(*TINY, "trainer=smoke", "trainer.iterations=9", "trainer.checkpoint_every=3"),
@@ -55,17 +56,35 @@ def test_settings_that_are_no_part_of_an_id_move_nothing(whole: RunFolder, tmp_p
     assert made(again) == made(whole)
 
 
-def test_a_plugin_whose_class_is_moved_has_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_with_other_questions_takes_the_models_that_are_there(whole: RunFolder):
+    """Metrics and bits are those of a run that trains."""
+    other, results = ("query=vocab_softmax", "protocol=lerf_ovs"), whole.path.parents[1]
+    assert run(composed(*SHORT, *other, f"results={results}/alone")) == 0
+    alone = only_run(results / "alone")
+    assert run(composed(*SHORT, *other, f"results={results}")) == 0
+    taken = RunFolder(whole.path.parent / alone.path.name)
+    assert made(taken) == made(alone)
+    assert made(taken)[0]["training"] == made(whole)[0]["training"]
+    (mine,), (his,) = (sorted(f.checkpoint.glob("*.safetensors"))[-1:] for f in (taken, whole))
+    assert mine.samefile(his)
+    assert taken.curves.read_bytes() == whole.curves.read_bytes()
+    assert not taken.curves.samefile(whole.curves)
+
+
+def test_a_plugin_whose_class_is_moved_has_its_run_and_one_that_is_edited_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     options, lab = tmp_path / "options" / "fusion", tmp_path / "my_lab"
     options.mkdir(parents=True)
     lab.mkdir()
     (lab / "__init__.py").touch()
     monkeypatch.syspath_prepend(tmp_path)
 
-    def told(module: str) -> str:
+    def told(module: str, then: str = "pass") -> str:
         (options / "gated.yaml").write_text(f"_target_: my_lab.{module}.Gated\n")
-        (lab / f"{module}.py").write_text("from vlgs.fusion.none import NoFusion\n\nclass Gated(NoFusion):\n    pass\n")  # fmt: skip
+        (lab / f"{module}.py").write_text(f"from vlgs.fusion.none import NoFusion\n\nclass Gated(NoFusion):\n    {then}\n")  # fmt: skip
         importlib.invalidate_caches()
+        sources_digest.cache_clear()
         given = (f"--config-dir={tmp_path}/options", "fusion=gated", "plugins=[my_lab]")
         said = command("run", [*given, f"results={tmp_path}/results", *SHORT])
         assert said.status == 0, said.text
@@ -76,3 +95,4 @@ def test_a_plugin_whose_class_is_moved_has_its_run(tmp_path: Path, monkeypatch: 
     assert "already done" not in told("gate")
     (lab / "gate.py").unlink()
     assert "already done" in told("moved")
+    assert "already done" not in told("moved", "gate = 1")

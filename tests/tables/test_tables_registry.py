@@ -84,13 +84,26 @@ def test_averages_are_those_of_the_scenes_but_for_the_papers_own_slips():
     assert len(slips) == 12, slips
 
 
+def test_a_table_of_ones_own_is_a_file(tmp_path: Path):
+    text = "label: mine\ncaption: c\ndataset: synthetic\nmetrics: [miou]\nrows: [{label: Full, set: []}]\n"
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(text)
+    assert [t.label for t in choose([str(mine), "value"], TABLES)] == ["mine", "value"]
+    ours = tmp_path / "value.yaml"
+    ours.write_text(text.replace("mine", "value"))
+    with pytest.raises(ValueError, match="must have a label of its own, got that of ours"):
+        choose([str(ours)], TABLES)
+    with pytest.raises(OSError, match="nowhere"):
+        choose([str(tmp_path / "nowhere.yaml")], TABLES)
+
+
 def test_tables_are_found_with_and_without_prefix():
     assert [t.label for t in choose(["tab:ab-cam", "value", "ab-cam"], TABLES)] == [
         "ab-cam",
         "value",
     ]
     assert len(choose(["all"], TABLES)) == len(TABLES)
-    with pytest.raises(ValueError, match=r"tab: must be all or one of .*ab-cam.*got ab-cma"):
+    with pytest.raises(ValueError, match=r"tab: must be all, one of .*ab-cam.*got ab-cma"):
         choose(["ab-cma"], TABLES)
 
 

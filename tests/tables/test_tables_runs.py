@@ -59,6 +59,28 @@ def test_any_folder_of_runs_is_compared(
     assert all(Path(row["run"]).is_dir() for row in rows)
 
 
+def test_a_table_for_papers_and_stages_in_a_word(results: Path, tmp_path: Path):
+    run = sorted(results.glob("runs/*"))[0]
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    stages = [{"_target_": "a.TrainColor", "name": "geometry"}, {"_target_": "a.Lift"}]
+    (run / "config.yaml").write_text(yaml.safe_dump(config | {"stages": stages}))
+    table = compare(read_runs(results))
+    assert "TrainColor+Lift" in {row[table.head.index("stages")] for row in table.rows}
+    table.write(tmp_path / "t.tex")
+    lines = (tmp_path / "t.tex").read_text().splitlines()
+    assert lines[0].startswith(r"\begin{tabular}{l")
+    assert {line.count("&") for line in lines if line.endswith(r"\\")} == {len(table.head) - 1}
+    assert r"mIoU \%" in lines[2]
+
+
+def test_a_name_that_no_table_has_is_refused_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys, "argv", ["tables", str(tmp_path), "write=mytab"])
+    with pytest.raises(SystemExit, match=r"write must end in \.csv, \.md or \.tex, got mytab"):
+        command.main()
+
+
 def test_a_damaged_run_is_left_out_and_a_folder_without_runs_refused(
     results: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):

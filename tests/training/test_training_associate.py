@@ -165,6 +165,10 @@ def test_levels_have_objects_of_their_own(tiny_scene: Scene):
     low = sums_of(dense)
     high = replace(low, mask=low.mask + 4)
     assert Associate("x").objects(joint, [low, high]).tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
+    none = sums_of(
+        [[0.0] * 8] * 2
+    )  # a level without masks, or with none that a Gaussian belongs to
+    assert Associate("x").objects(joint, [low, none]).tolist() == [0, 1, 0, 1, -1, -1, -1, -1]
 
 
 def test_what_cannot_be_associated_is_refused(tiny_scene: Scene):

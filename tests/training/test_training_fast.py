@@ -110,6 +110,27 @@ def test_rates_of_colour_and_shape_fall_along_half_a_cosine(tiny_scene: Scene):
     assert rates["means"] == pytest.approx(module.settings.means_rate(8) * module.densifying.extent)
 
 
+def test_language_that_has_a_shape_of_its_own_learns_it_as_colour_does(tiny_scene: Scene):
+    module = module_of(tiny_scene, *LESS, "sharing=pos", "trainer.rates_for=64")
+    module.set_schedule(8)
+    rates = {group["name"]: group["lr"] for group in module.optimizer.param_groups}
+    assert rates["language_log_scales"] == rates["log_scales"]
+    assert rates["language_quats"] == rates["quats"]
+
+
+def test_a_count_that_is_full_is_told_once(
+    tiny_scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    full = len(tiny_scene.points)
+    room = "gaussians.background=0"
+    trained(tiny_scene, tmp_path / "full", *LESS, room, f"gaussians.max_count={full}")
+    (said,) = [r.getMessage() for r in caplog.records if "max_count" in r.getMessage()]
+    assert said.startswith(f"iteration 4: gaussians.max_count={full} leaves no room for ")
+    caplog.clear()
+    trained(tiny_scene, tmp_path / "free", *LESS, room)
+    assert "max_count" not in caplog.text
+
+
 def test_rates_made_for_another_budget_grow_by_the_root(tiny_scene: Scene):
     plain, paced = (
         module_of(tiny_scene, *LESS, f"trainer.rates_for={made}") for made in ("null", 64)

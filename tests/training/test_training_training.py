@@ -2,6 +2,7 @@ import math
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from tiny_runs import TINY, composed
 from torch import Tensor
 
 from vlgs.config import instantiate
+from vlgs.gaussians.densify import DensifyReport
 from vlgs.objectives.targets import Target, TrainingViews
 from vlgs.runs import RunFolder
 from vlgs.training.build import Parts, build_module
@@ -170,8 +172,9 @@ def test_densification_is_part_of_the_training_time(
 ):
     clock = {"now": 0.0}
 
-    def slow_densify(*args: object) -> None:
+    def slow_densify(*args: object) -> DensifyReport:
         clock["now"] += 100.0
+        return DensifyReport(0, 0, 0, 0)
 
     now = SimpleNamespace(perf_counter=lambda: clock["now"])
     monkeypatch.setattr("vlgs.training.callbacks.time", now)
@@ -193,7 +196,12 @@ def test_a_budget_that_ends_on_a_densification_leaves_it_out(
 ):
     after: list[int] = []
     resets: list[object] = []
-    monkeypatch.setattr("vlgs.training.callbacks.densify", lambda *args: after.append(args[6]))
+
+    def recorded(*args: object) -> DensifyReport:
+        after.append(cast(int, args[6]))
+        return DensifyReport(0, 0, 0, 0)
+
+    monkeypatch.setattr("vlgs.training.callbacks.densify", recorded)
     monkeypatch.setattr("vlgs.training.callbacks.reset_opacity", lambda *args: resets.append(args))
     train(module_of(tiny_scene, f"trainer.iterations={iterations}"), tmp_path)
     assert (after, len(resets)) == (densified, reset)

@@ -308,7 +308,7 @@ def query(parser: ArgumentParser) -> Runner:
 
 
 def repeat(parser: ArgumentParser) -> Runner:
-    """One run of each committed table again, compared number by number; 1 if one differs on such a machine."""
+    """One run of each committed table again, compared number by number; 1 if one differs on the same CPU and instruction set."""
     parser.add_argument("--results", type=Path, default=Path("results"), help="with runs.csv")
     parser.add_argument("--tables", nargs="+", default=[], help="labels; default: all")
     parser.add_argument(

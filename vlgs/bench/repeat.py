@@ -70,7 +70,7 @@ class Repeated:
 
     @property
     def holds(self) -> bool:
-        """Whether the tables' promise is kept: the same id, and on such a machine the same numbers."""
+        """Whether the tables' promise is kept: the same id, and on the same CPU and instruction set the same numbers."""
         return self.same_id and (self.differing == 0 or not self.same_machine)
 
 
@@ -127,8 +127,8 @@ def choose_runs(
         if line.results_version == RESULTS_VERSION:
             key = line.recipe, line.data_recipe, line.scene, line.seed
             runs.setdefault(key, []).append(line)
-    chosen: dict[str, Recorded] = {}
-    found = []
+    chosen: set[str] = set()
+    found: list[Recorded] = []
     for file in sorted(results.glob("*/benchmark.yaml")):
         benchmark = Benchmark.read(file)
         if benchmark.overrides[0] != "data=synthetic":
@@ -143,7 +143,7 @@ def choose_runs(
                 fresh = [one for one in own if one.run not in chosen] or own
                 if fresh:
                     found.append(random.Random(f"{seed} {file.parent.name} {label}").choice(fresh))
-                    chosen[found[-1].run] = found[-1]
+                    chosen.add(found[-1].run)
     if not found:
         raise ValueError(
             f"bench: {results} must hold runs.csv and tables of results version {RESULTS_VERSION} ({', '.join(labels) or 'any'}), got none"

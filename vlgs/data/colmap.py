@@ -197,7 +197,10 @@ def _few_views(source: ColmapSource, views: Sequence[ViewSource]) -> Iterator[Fa
 
 
 def _feature_folder(source: ColmapSource) -> Path | None:
+    """The folder that was named; else the usual one, if there is a map in it: `vlgs.features` that was stopped early may have made none."""
     default = source.folder / "language_features"
+    if source.features is None and not any(default.glob("*_[sf].npy")):
+        return None
     return _named_or_default(source.features, default, "features")
 
 

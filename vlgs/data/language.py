@@ -142,7 +142,7 @@ def read_vocabulary(path: Path) -> Vocabulary:
     if not path.is_file():
         raise FileNotFoundError(f"vocabulary: file must exist, got {path}")
     try:
-        names, vectors = _read_npz(path) if path.suffix == ".npz" else _read_json(path)
+        names, vectors = _read_npz(path) if path.suffix.lower() == ".npz" else _read_json(path)
         "".join(names).encode()  # half of a surrogate pair cannot be printed or written
     except SceneError:
         raise

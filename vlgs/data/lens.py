@@ -161,19 +161,31 @@ def shrink_pixels(
     return torch.from_numpy(np.array(small))
 
 
-def move_boxes(boxes: Float64[np.ndarray, "b 4"], lens: Lens) -> Float64[np.ndarray, "b 4"]:
-    """Boxes ``(x1, y1, x2, y2)`` in pixels of the file -> the smallest ones in the output that hold the moved outlines.
+def move_boxes(
+    boxes: Float64[np.ndarray, "b 4"], size: tuple[int, int], lens: Lens
+) -> Float64[np.ndarray, "b 4"]:
+    """Boxes ``(x1, y1, x2, y2)`` of pixels, edges inclusive -> the smallest ones in the output that hold the moved outlines.
 
-    A box of which the output shows nothing is NaN: no pixel lies in it.
+    A pixel of the output belongs to a box by its centre, as it belongs to a mask (`nearest_pixels`). A box of which the output
+    shows nothing is NaN: no pixel lies in it.
+
+    Args:
+        boxes: In pixels of an image that covers the file; a box of two other corners is the same box.
+        size: Width and height of that image; it may be coarser or finer than the file.
+        lens: The mapping.
     """
+    ratio = np.divide(lens.file_size, size)
+    corners = boxes.reshape(-1, 2, 2)
+    lows = np.ceil(corners.min(axis=1)) * ratio
+    highs = (np.floor(corners.max(axis=1)) + 1) * ratio
     moved = np.full_like(boxes, np.nan)
-    for i, box in enumerate(boxes):
-        corner, extent = box[:2], box[2:] - box[:2]
-        outline = corner + _border((1, 1), margin=0.0, samples=33) * extent
-        at = lens.from_file(outline)
+    for i, (low, high) in enumerate(zip(lows, highs, strict=True)):
+        at = lens.from_file(low + _border((1, 1), margin=0.0, samples=33) * (high - low))
         at = at[np.isfinite(at).all(axis=1)]
         if len(at):
-            moved[i] = [*at.min(axis=0), *at.max(axis=0)]
+            first, last = np.ceil(at.min(axis=0) - 0.5), np.ceil(at.max(axis=0) - 0.5) - 1
+            if (first <= last).all():
+                moved[i] = [*first, *last]
     return moved
 
 

@@ -82,12 +82,11 @@ class ViewSource:
         """Masks and boxes of the labelled objects, moved to the output's pixels."""
         assert isinstance(self.labels, ObjectFolder)
         image = self.labels.images[self.name]
-        width, height = self.lens.size
-        boxes = {}
-        for category, rows in image.boxes().items():
-            in_file = rows * np.tile(np.divide(self.lens.file_size, (image.width, image.height)), 2)
-            moved = move_boxes(in_file, self.lens)
-            boxes[category] = torch.from_numpy(moved.clip(0, [width, height] * 2)).float()
+        size = image.width, image.height
+        boxes = {
+            category: torch.from_numpy(move_boxes(rows, size, self.lens)).float()
+            for category, rows in image.boxes().items()
+        }
         # One at a time: thousands of categories do not fit into memory side by side.
         return ObjectLabels(_Masks(image.categories, lambda c: self._warp_mask(image, c)), boxes)
 

@@ -115,10 +115,13 @@ def selected(opened: OpenedRun, name: str, level: int | None = None) -> Content:
 
 
 def drawn(content: Content) -> Content:
-    """Without Gaussians that no weight draws anywhere."""
+    """Without Gaussians that no weight draws anywhere; a note counts them."""
     opacity = content.cloud.params["opacity_logits"].sigmoid()
     largest = torch.stack([opacity, *content.weights]).amax(dim=0)
-    return content.keep((largest >= LEAST).nonzero()[:, 0])
+    kept = content.keep((largest >= LEAST).nonzero()[:, 0])
+    left = content.count - kept.count
+    note = f"{left:,} of {content.count:,} Gaussians left out, which nothing draws"
+    return replace(kept, notes=[*kept.notes, *([note] if left else [])])
 
 
 def most_important(content: Content, opened: OpenedRun, most: int) -> Content:

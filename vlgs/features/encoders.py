@@ -168,7 +168,7 @@ class DenseMaps:
         return out
 
     def _read(self, stem: str) -> np.ndarray:
-        path = self.folder / self.pattern.format(stem=stem)
+        path = self.folder / self.pattern.replace("{stem}", stem)
         if not path.is_file():
             raise FileNotFoundError(
                 f"features: {path} must be the feature map of photograph {stem}, got no such file"

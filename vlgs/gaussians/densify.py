@@ -24,7 +24,7 @@ CHILDREN = 2
 SHRINK = 1.6
 """Their scales are the parent's divided by this (3DGS: 0.8 times the number of children)."""
 BACKGROUND = 4.0
-"""What is more scene extents away from every training camera is a background, which may be as large as it is far."""
+"""What is more scene extents away from every training camera is a background, which may have any size."""
 MIN_COUNT = 16
 """Pruning leaves at least this many, so that a bad step cannot end a run with an empty scene."""
 
@@ -83,6 +83,8 @@ class DensifyReport:
     """Gaussians removed, without the split parents."""
     count: int
     """Gaussians afterwards."""
+    refused: int = 0
+    """Gaussians that should have been cloned or split, but for `max_count`."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def densify(
         extent: `vlgs.geometry.scene_extent` of the training cameras, world units.
         seed: Of the run.
         step: Of the run; large Gaussians are spared until the first opacity reset has passed.
-        centers: Of the training cameras; what is `BACKGROUND` away from all of them may be large. None: nothing may.
+        centers: Of the training cameras; what is behind them may be large, and larger the farther it is. None: nothing may.
         attributes: The table of `params`.
 
     Raises:
@@ -135,8 +137,8 @@ def densify(
         raise ValueError(f"densify: state must have {n} rows, got {state.grad_sum.shape[0]}")
     with torch.no_grad():
         dead = _dead(params, config, attributes)
-        grow = _hot(state, config) & ~dead
-        grow = _highest(grow, state.mean(), config.max_count - int((~dead).sum()))
+        hot = _hot(state, config) & ~dead
+        grow = _highest(hot, state.mean(), config.max_count - int((~dead).sum()))
         small = _largest_scale(params, attributes) <= config.densify.dense_share * extent
         rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
         values = {name: value[rows.source] for name, value in params.items()}
@@ -147,7 +149,8 @@ def densify(
     _replace(params, optimizer, values, rows)
     state.restart(rows.source.shape[0])
     cloned, split, count = int((grow & small).sum()), int((grow & ~small).sum()), len(rows.source)
-    return DensifyReport(cloned, split, pruned=n + cloned + split - count, count=count)
+    pruned, refused = n + cloned + split - count, int((hot & ~grow).sum())
+    return DensifyReport(cloned, split, pruned, count, refused)
 
 
 def reset_opacity(
@@ -283,14 +286,19 @@ def _not_large(
     """Gaussians that stay, once large ones are looked for.
 
     3DGS also names a radius of 20 px on the screen; its code as released clears the radii just before it looks at
-    them, so that only the size in the world ever counted. That is what is done here, but a background may be large.
+    them, so that only the size in the world ever counted. That is what is done here, but what is farther from the middle of the
+    cameras than all of them may grow with its distance, by twice the share, since a background (`vlgs.gaussians.background`) starts
+    as wide as it is far.
     """
     largest, first_reset = _largest_scale(values, attributes), config.densify.reset_every
     if not config.densify.prune_large or first_reset == 0 or step <= first_reset:
         return torch.ones_like(largest, dtype=torch.bool)
-    large = largest > config.densify.max_scale_share * extent
+    size = torch.full_like(largest, extent)
     if centers is not None:
-        large &= distance_to_nearest(values["means"].float(), centers) < BACKGROUND * extent
+        means = values["means"].float()
+        size += 2 * ((means - centers.mean(dim=0)).norm(dim=1) - extent).clamp_min(0)
+        size[distance_to_nearest(means, centers) >= BACKGROUND * extent] = math.inf
+    large = largest > config.densify.max_scale_share * size
     return ~_spare(large, -largest)
 
 

@@ -1,4 +1,4 @@
-"""Finds Gaussians whose parameters no renderer can use (not finite, or a quaternion of zero), to refuse or to drop them."""
+"""Finds Gaussians whose parameters no renderer can use (not finite, too large, or a quaternion of zero), to refuse or to drop them."""
 
 from collections.abc import Mapping
 
@@ -8,9 +8,12 @@ from torch import Tensor
 
 from vlgs.gaussians.attributes import STANDARD
 
+_LARGEST = 40.0
+"""Logarithm of a scale whose square is far from overflowing float32."""
+
 
 def broken_rows(params: Mapping[str, Tensor]) -> dict[str, Bool[Tensor, " n"]]:
-    """What is wrong -> rows; only what occurs. Not finite, or a quaternion without a direction.
+    """What is wrong -> rows; only what occurs. Not finite, larger than float32 can hold, or a quaternion without a direction.
 
     Args:
         params: Raw parameters, of any attributes.
@@ -24,6 +27,8 @@ def broken_rows(params: Mapping[str, Tensor]) -> dict[str, Bool[Tensor, " n"]]:
     for name, value in params.items():
         if name in STANDARD and STANDARD[name].role == "rotation":
             found[f"{name} must not be zero"] = value.norm(dim=1) == 0
+        if name in STANDARD and STANDARD[name].role == "scale":
+            found[f"{name} must be at most {_LARGEST:g}"] = (value > _LARGEST).any(dim=1)
     return {what: rows for what, rows in found.items() if rows.any()}
 
 

@@ -5,7 +5,8 @@ localisation, so there is none.
 
 `ovs3d_argmax` follows the data set's authors: a pixel belongs to the class of the scene's whole list that it resembles most, and
 each class of each view has an IoU. `ovs3d_threshold` follows LangSplatV2's script, the best documented stand-in for the
-evaluation behind LangSplat's numbers, which was never released: one binary mask per prompt. `mipnerf360_gags` is the same
+evaluation behind LangSplat's numbers, which was never released: one binary mask per prompt. The script asks for the scene `room`'s
+"wood wall" with a second prompt, "wood table", and joins both masks; here every class is one prompt. `mipnerf360_gags` is the same
 segmentation on GAGS's labels of Mip-NeRF 360, with all levels and LangSplat's threshold; it is not `mipnerf360_goi`.
 """
 

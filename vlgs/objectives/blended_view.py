@@ -1,5 +1,7 @@
 """Language from a blended camera: the third term of Eq. 12, with Eqs. 9 to 11."""
 
+from typing import ClassVar
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -25,6 +27,8 @@ class BlendedView(Objective):
     """
 
     needs = frozenset({"feature"})
+    blends: ClassVar[bool] = True
+    """It looks at blended views."""
 
     def __init__(self, weight: float = 1.2) -> None:
         require_range("blended view", 0, MOST, weight=weight)

@@ -1,6 +1,7 @@
 """Cameras to render from: those of the photographs, an orbit, or a file of nerfstudio's or COLMAP's."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +65,7 @@ def cameras_of(run: OpenedRun, which: str, frames: int = 120) -> CameraPath:
     if named:
         return CameraPath(named[:1])
     path = Path(which)
-    if not path.exists():
+    if not which.strip() or not path.exists():
         raise ValueError(
             f"cameras: must be train, test, orbit, a photograph's name or a file, got {which!r}"
         )
@@ -229,13 +230,29 @@ def _reconstruction(path: Path) -> list[NamedCamera]:
     file = str(model.file("cameras"))
     lenses = {c.camera_id: make_lens(c, (c.width, c.height), 1.0, file) for c in model.cameras}
     frames = []
-    for image in sorted(model.images, key=lambda image: image.name):
+    images = sorted(model.images, key=lambda image: image.name)
+    names = _distinct([image.name for image in images])
+    for image, name in zip(images, names, strict=True):
         lens = lenses[image.camera_id]
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3] = quat_to_rotmat(torch.tensor(image.quat, dtype=torch.float64))
         viewmat[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
         camera = Camera(viewmat.float(), torch.from_numpy(lens.intrinsics()).float(), *lens.size)
-        frames.append(NamedCamera(Path(image.name).stem, "file", camera))
+        frames.append(NamedCamera(name, "file", camera))
     if not frames:
         raise ValueError(f"cameras: {path} must have an image, got none")
     return frames
+
+
+def _distinct(images: Sequence[str]) -> list[str]:
+    """Names for pictures of images: their stems; with folder and suffix where two have the same stem.
+
+    Example:
+        >>> _distinct(["left/1.jpg", "right/1.jpg", "right/2.jpg"])
+        ['left_1.jpg', 'right_1.jpg', '2']
+    """
+    stems = Counter(Path(image).stem for image in images)
+    return [
+        stem if stems[stem := Path(image).stem] == 1 else image.replace("/", "_")
+        for image in images
+    ]

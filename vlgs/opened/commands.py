@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vlgs.config import MOST_THREADS
 from vlgs.runs import STOPPED
@@ -27,7 +27,7 @@ def new_parser(module: str, description: str | None, epilog: str) -> argparse.Ar
 
 
 def add_words(parser: argparse.ArgumentParser) -> None:
-    """Options that say where vectors of words come from, and how many threads there are."""
+    """Options that say where vectors of words come from, how many threads there are, and whose parts are trusted."""
     group = parser.add_argument_group("words that the run's vocabulary lacks")
     group.add_argument("--vocabulary", type=Path, metavar="FILE", help="further words and vectors")
     group.add_argument(
@@ -48,6 +48,20 @@ def add_words(parser: argparse.ArgumentParser) -> None:
         help="by how much a cosine with a word may be off: at 0.005 many answers of one scene take a hundredth of the time (%(default)g: by rounding)",
     )
     parser.add_argument("--threads", type=int, default=2, help="CPU threads (%(default)s)")
+    parser.add_argument(
+        "--plugins",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="PACKAGE",
+        help="packages of your own that the run has parts of, after everything else: my_lab",
+    )
+
+
+def given_to_open(args: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of `vlgs.opened.open_run` on a command line with `add_words`."""
+    names = ("vocabulary", "text", "template", "within", "plugins")
+    return {name: getattr(args, name) for name in names}
 
 
 def opened(args: argparse.Namespace, folder: Path | None = None) -> "OpenedRun":
@@ -63,7 +77,7 @@ def opened(args: argparse.Namespace, folder: Path | None = None) -> "OpenedRun":
     from vlgs.opened.run import open_run
 
     torch.set_num_threads(args.threads)
-    run = open_run(folder or args.run, args.vocabulary, args.text, args.template, args.within)
+    run = open_run(folder or args.run, **given_to_open(args))
     if run.step is not None:
         print(f"{run.path}: not finished, shown as of step {run.step}", file=sys.stderr)
     return run

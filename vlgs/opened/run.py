@@ -6,11 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_object
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
-from vlgs.config import check_targets, instantiate
+from vlgs.config import check_targets, find, instantiate
 from vlgs.earlier import as_today
 from vlgs.fields import NO_LANGUAGE, Field, faster
 from vlgs.fields.saved import MakePart
@@ -19,7 +20,17 @@ from vlgs.opened.words import Words
 from vlgs.places import found_again
 from vlgs.queries import Query, Questions
 from vlgs.runs import RunFolder
+from vlgs.targets import require_importable, require_plugins
 from vlgs.training.checkpoint import load_checkpoint
+
+_DAMAGED = (
+    *(OmegaConfBaseException, HydraException, YAMLError, UnicodeDecodeError),
+    *(AssertionError, AttributeError, KeyError, TypeError, RecursionError),
+)
+"""What reading a configuration that is none ends in."""
+
+_NEEDED = frozenset({"query", "text"})
+"""Keys that every run has recorded, and that answers are made with."""
 
 _FREE = frozenset({"vlgs.fusion.none.NoFusion", "vlgs.indicator.Learned"})
 """What a model may have in place of what the configuration chooses: nothing that takes an argument."""
@@ -85,6 +96,7 @@ def open_run(
     text: str | None = None,
     template: str = "{}",
     within: float | None = None,
+    plugins: Sequence[str] = (),
 ) -> OpenedRun:
     """Open the folder of a run, finished or still training.
 
@@ -94,38 +106,59 @@ def open_run(
         text: Name or folder of a CLIP or SigLIP whose text tower encodes what no vocabulary has; None: that of the run, if it had one.
         template: Sentence around words that a text tower encodes.
         within: By how much cosines may be off, to save time (`vlgs.fields.faster`); None: as scores are made.
+        plugins: Packages whose parts may be made where the run has them; what its files say by themselves is trusted by nobody.
 
     Raises:
-        ValueError: If it is no run folder, has nothing to show yet, or is of another version.
+        ValueError: If a plugin is not there, or it is no run folder, has nothing to show yet, or is of another version.
         OSError: If a file cannot be read.
     """
     path = Path(folder)
     run = RunFolder(path)
     if not run.config.is_file():
         raise ValueError(f"{path}: must be the folder of a run, with config.yaml in it, got none")
-    config = read_config(path)
+    config = read_config(path, plugins)
+    query = _query(run, config)
     notes = read_scene(run)
     field, step = _field(run, partial(_make, config))
     field = field if within is None else faster(field, within)
     known = Words.of(notes.vocabulary, config.text, vocabulary, text, template)
-    return OpenedRun(path, field, notes, instantiate(config.query), known, step)
+    return OpenedRun(path, field, notes, query, known, step)
 
 
-def read_config(path: Path) -> DictConfig:
-    """The configuration of a run folder in today's words. It names no class but ours.
+def read_config(path: Path, plugins: Sequence[str] = ()) -> DictConfig:
+    """The configuration of a run folder in today's words. It names no class but ours and those of the plugins.
 
     Raises:
-        ValueError: If it is not that of a run.
+        ValueError: If it is not that of a run, or a plugin is not there; the file is named.
+    """
+    require_importable(require_plugins(plugins))
+    file = RunFolder(path).config
+    try:
+        recorded = found_again(path.resolve())
+        missing = sorted(_NEEDED - {key for key, value in recorded.items() if value is not None})
+        config = as_today(recorded)
+        # A file's word is nobody's trust.
+        check_targets(config, plugins=plugins, trust="--plugins {}")
+    except _DAMAGED as error:
+        reason = str(error).partition("\n")[0] or "a list"
+        raise ValueError(f"{file}: must be that of a run, got: {reason:.200}") from error
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    if missing:  # the defaults would answer in its name
+        raise ValueError(f"{file}: must be that of a run, got none of {', '.join(missing)}")
+    return config
+
+
+def _query(run: RunFolder, config: DictConfig) -> Query:
+    """How relevancy is computed.
+
+    Raises:
+        ValueError: If the configuration has a value that cannot be; the file is named.
     """
     try:
-        config = as_today(found_again(path.resolve()))
-        check_targets(config, plugins=())  # a file's word is nobody's trust
-    except (OmegaConfBaseException, UnicodeDecodeError, AssertionError) as error:
-        reason = str(error).partition("\n")[0]
-        raise ValueError(
-            f"{path}/config.yaml: must be that of a run, got: {reason:.200}"
-        ) from error
-    return config
+        return instantiate(config.query)
+    except ValueError as error:
+        raise ValueError(f"{run.config}: {error}") from error
 
 
 def _field(run: RunFolder, make: MakePart) -> tuple[Field, int | None]:
@@ -158,5 +191,5 @@ def _make(config: DictConfig, group: str, path: str) -> Any:
 
 def _home(target: str) -> str:
     """Where a class is defined."""
-    made = get_object(target)
+    made = find(target)
     return f"{made.__module__}.{made.__qualname__}"

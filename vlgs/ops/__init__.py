@@ -8,9 +8,8 @@ here, or a function in the tests that the docstring names.
 
 from importlib.util import find_spec
 
-if (
-    find_spec("vlgs.ops._csrc") is None
-):  # a checkout that nobody installed, or one installed before the kernels moved
+# Missing in a checkout that nobody installed, or one installed before the kernels moved here.
+if find_spec("vlgs.ops._csrc") is None:
     raise ImportError(
         "vlgs: compiled kernels must be there, got none in vlgs/ops; python -m pip install -e . makes them"
     )

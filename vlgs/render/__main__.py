@@ -61,7 +61,7 @@ def render(args: argparse.Namespace) -> None:
         OSError: If a file cannot be read or written.
     """
     formats = _listed(args.format)
-    for one in formats:
+    for one in formats or [args.format]:
         require_choice("render", "format", one, FORMATS)
     require_choice("render", "depth", args.depth, ("expected", "median"))
     require_range("render", 1e-3, 1e3, fps=args.fps)

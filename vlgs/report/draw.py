@@ -40,7 +40,7 @@ class ViewPictures:
     features: UInt8[Tensor, "h w 3"] | None = None
     """None where no language was trained, or the field renders no features."""
     difference: UInt8[Tensor, "h w 3"] | None = None
-    """l - o as seen from the view (Fig. 3); None where no language was trained, or the field has no Gaussians."""
+    """l - o as seen from the view (Fig. 3); None where `Painter.has_difference` is false."""
     labels: UInt8[Tensor, "h w 3"] | None = None
     """True classes, where the view has one for every pixel."""
     prediction: UInt8[Tensor, "h w 3"] | None = None
@@ -79,6 +79,8 @@ class Painter:
         self.field, self.scene, self.query, self.prompts = field.levels()[-1], scene, query, prompts
         self.gaussians = self.field if isinstance(self.field, HasGaussians) else None
         self.has_language = len(scene.mask_vectors) > 0
+        self.has_difference = self.has_language and _differ(self.gaussians)
+        """Whether l - o is drawn: not where the field has no Gaussians, or l is o in all of them."""
         self.feature_colors = self._feature_colors(views)
         self.times_asked = dict.fromkeys(scene.classes, 0)
         self.ranges = None if scene.classes or prompts is None else self._ranges(views)
@@ -95,7 +97,7 @@ class Painter:
         if self.feature_colors is not None and answer.feature is not None:
             shown = paint_features(answer.feature[0], self.feature_colors)
             pictures = replace(pictures, features=shown)
-        if self.has_language and self.gaussians is not None:
+        if self.has_difference and self.gaussians is not None:
             difference = indicator_difference(self.gaussians, view.camera)
             pictures = replace(pictures, difference=colors.diverging(difference))
         if self.prompts is None:
@@ -195,3 +197,10 @@ class Painter:
             prediction=colors.paint_labels(prediction, count),
             classes=tuple(sorted(shown)),
         )
+
+
+def _differ(gaussians: HasGaussians | None) -> bool:
+    """Whether some Gaussian's language is blended by another weight than its colour."""
+    if gaussians is None:
+        return False
+    return not torch.equal(gaussians.language_weights(), gaussians.opacities())

@@ -63,8 +63,9 @@ def evaluate(
     """Render every held-out view once and score colour and language.
 
     Units of LERF-OVS come from object labels where a view has them, otherwise one per class that its dense labels show: such a
-    unit has no box, and a hit is a pixel of its mask. The ceiling is what LERF-OVS gives to exact features, where every pixel
-    carries the text vector of its true class.
+    unit has no box, and a hit is a pixel of its mask. Beside its scores stand those of exact
+    features (`_ceiling`), where every pixel carries the text vector of its true class: most answers stay below them, one that is
+    smoother may pass them where a class is smaller than the window of the protocol.
 
     Args:
         field: The trained scene.

@@ -1,4 +1,4 @@
-"""Language scores, gathered view by view: by the chosen protocol, by two others for comparison, and the ceilings that exact features would reach."""
+"""Language scores, gathered view by view: by the chosen protocol, by two others for comparison, and what exact features score."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -62,7 +62,7 @@ def write_histogram(path: Path, density: Float[Tensor, " bins"]) -> None:
 
     with rc_context(STYLE):
         figure = Figure(figsize=(4.0, 2.4))
-        _draw_histogram(figure.add_axes((0.03, 0.2, 0.94, 0.76)), density)
+        _draw_histogram(figure.add_axes((0.07, 0.2, 0.86, 0.76)), density)
         _save(figure, path)
 
 
@@ -145,7 +145,7 @@ class _Sheet:
         columns = [c for c in known if any(c in row for row in tiles)]
         heights = [TILE * row.photograph.shape[0] / row.photograph.shape[1] for row in rows]
         self.width = 2 * MARGIN + len(columns) * (TILE + GAP)
-        has_foot = not set(columns) <= {PHOTOGRAPH, RENDER}
+        has_foot = not set(columns) <= {PHOTOGRAPH, RENDER, FEATURES}
         foot = FOOT if has_foot else 0
         self.height = 2 * MARGIN + sum(heights) + GAP * len(rows) + foot
         self.figure = Figure(figsize=(self.width, self.height))

@@ -20,6 +20,9 @@ from vlgs.types import Scene, View
 
 T = TypeVar("T")
 
+OVERVIEW = "overview.png"
+"""Written after all other pictures."""
+
 
 @dataclass(frozen=True)
 class PictureLimits:
@@ -52,7 +55,7 @@ def write_pictures(
         scene: Its held-out views and labels.
         query: How relevancy is computed.
         prompts: The scene's classes, encoded, or words for a scene without any; without either only colour, features and
-            l - o are drawn, and colour alone where no language was trained. l - o needs Gaussians.
+            l - o are drawn, and colour alone where no language was trained. l - o needs Gaussians, and an l that is not o in all.
         limits: How many views and prompts.
         kept: Answers that scores were made from; None: all are made here.
 
@@ -76,11 +79,11 @@ def write_pictures(
         if view.name in on_overview:
             rows.append(pictures)
     density = None
-    if painter.has_language and painter.gaussians is not None:
+    if painter.has_difference and painter.gaussians is not None:
         gaussians = painter.gaussians
         density = count_difference(gaussians.language_weights(), gaussians.opacities())
         write_histogram(folder / "indicator_minus_opacity.png", density)
-    path = folder / "overview.png"
+    path = folder / OVERVIEW
     write_overview(path, prompts.names if prompts else (), rows, density)
     return path
 

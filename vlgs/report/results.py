@@ -37,8 +37,14 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "pixel_accuracy": ("0..1", "share of pixels whose class is right"),
     "miou_lerf_ovs": ("0..1", "relevancy over threshold, mean over units (view, category)"),
     "loc_acc_lerf_ovs": ("0..1", "hits / units"),
-    "miou_lerf_ovs_ceiling": ("0..1", "miou_lerf_ovs of exact features: what can be reached"),
-    "loc_acc_lerf_ovs_ceiling": ("0..1", "loc_acc_lerf_ovs of exact features"),
+    "miou_lerf_ovs_ceiling": (
+        "0..1",
+        "miou_lerf_ovs of exact features; smoother answers can pass it",
+    ),
+    "loc_acc_lerf_ovs_ceiling": (
+        "0..1",
+        "loc_acc_lerf_ovs of exact features; smoother answers can pass it",
+    ),
     "loc_acc_dense": ("0..1", "classes of a view whose most relevant spot lies on them"),
     "loc_acc_dense_ceiling": ("0..1", "loc_acc_dense of exact features"),
     "hits_lerf_ovs": ("", "units whose most relevant pixel lies on the object"),
@@ -67,7 +73,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "skip of vlgs.skips -> skipped (count), share (of that work), seconds_saved (wall time: count x mean cost of the "
         "forward part in this run; null where none was done to measure)",
     ),
-    "peak_rss_bytes": ("B", "most memory the process ever held, reading to reporting"),
+    "peak_rss_bytes": (
+        "B",
+        "most memory the process ever held, reading to reporting; of the run that trained the models if that was another",
+    ),
     "fps_color": (
         "1/s",
         "colour render, median; with several levels of the model of whole objects",
@@ -86,6 +95,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "dataset": ("", "option of conf/data"),
     "scene": ("", "name of the scene"),
     "fingerprint": ("", "hash of the data's content"),
+    "training": ("", "hash of all that can move a model: runs of one hash have the same models"),
     "results_version": ("", "raised by changes of vlgs that can move a number"),
     "commit": ("", "git commit, +dirty with local changes, null for an installed wheel"),
     "machine": ("", "cpu, isa (instruction set of the kernels), cores, threads, torch, platform"),

@@ -32,6 +32,9 @@ _ROWS = (
 )
 _SILENT = ("lpips",)  # never available, which metrics.json says
 _ALWAYS = ("psnr", "ssim", "miou", "loc_acc")
+_BY_PROTOCOL = ("miou", "loc_acc")
+_LAST_MIOU = "miou_other"
+"""The row under which the classes that mIoU is the mean of stand."""
 
 
 def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> RenderableType:
@@ -51,17 +54,14 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
             table.add_row(label, form.format(value))
         elif name in _ALWAYS:
             table.add_row(label, "--")
-    per_category = metrics.get("per_category") or {}
-    for category, iou in per_category.items():
-        table.add_row(
-            Text(visible(f"  {category}")), "--" if iou is None else f"{iou:.1%}", style="dim"
-        )
+        if name == _LAST_MIOU:
+            _add_classes(table, metrics.get("per_category") or {})
     for name, entry in (metrics.get("skips") or {}).items():
-        table.add_row(Text(visible(f"  skipped: {name}")), _skipped(entry), style="dim")
-    reasons = {
-        name: why for name, why in (metrics.get("reasons") or {}).items() if name not in _SILENT
-    }
-    notes = [_text(f"{name}: {why}", style="yellow") for name, why in reasons.items()]
+        table.add_row(Text(visible(f"skipped: {name}")), _skipped(entry), style="dim")
+    notes = [
+        _text(f"{', '.join(names)}: {why}", style="yellow")
+        for why, names in _reasons(metrics.get("reasons") or {}).items()
+    ]
     if metrics.get("failure"):
         notes.append(_text(f"failed: {metrics['failure']}", style="bold red"))
     if seen:
@@ -69,13 +69,34 @@ def summary(metrics: Mapping[str, Any], paths: Mapping[str, Path]) -> Renderable
         notes.append(Text(told, style="yellow"))
     width = max((len(label) for label in paths), default=0)
     places = [_text(f"{label:<{width}}  {path}") for label, path in paths.items()]
-    told = [f"protocol: {metrics.get('protocol')}"]
+    told = []
+    if any(metrics.get(name) is not None for name in _BY_PROTOCOL):
+        told.append(f"protocol: {metrics.get('protocol')}")
     if metrics.get("query"):
         told.append(f"query: {metrics['query']}")
     if metrics.get("levels"):
         several = f" ({metrics.get('level_models')})" if len(metrics["levels"]) > 1 else ""
         told.append(f"mask levels: {', '.join(map(str, metrics['levels']))}{several}")
     return Group(table, *notes, *map(_text, told), *places)
+
+
+def _add_classes(table: Table, per_category: Mapping[str, float | None]) -> None:
+    """A row for each class, under one that says what they are."""
+    if per_category:
+        table.add_row("IoU of each class", "")
+    for category, iou in per_category.items():
+        table.add_row(
+            Text(visible(f"  {category}")), "--" if iou is None else f"{iou:.1%}", style="dim"
+        )
+
+
+def _reasons(reasons: Mapping[str, str]) -> dict[str, list[str]]:
+    """Why something is not there -> the metrics that are not."""
+    found: dict[str, list[str]] = {}
+    for name, why in reasons.items():
+        if name not in _SILENT:
+            found.setdefault(why, []).append(name)
+    return found
 
 
 def _text(text: str, style: str = "") -> Text:

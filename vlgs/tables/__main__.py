@@ -5,7 +5,7 @@
     python -m vlgs.tables results=FOLDER   other than ./results
     python -m vlgs.tables html=true        index.html of each benchmark, with plots, and one page over all of them too
     python -m vlgs.tables FOLDER           one line for each run of any folder of runs: what differs, scores, where it lies
-    python -m vlgs.tables FOLDER write=F   the same to a file F.csv or F.md
+    python -m vlgs.tables FOLDER write=F   the same to a file F.csv, F.md or F.tex
 
 Writes results/runs.csv (one row per run) and categories.csv (one per run and category; both in runs.parquet with pyarrow), and per
 benchmark <label>.csv, .md and .tex, <label>-claims.csv with every difference, interval and verdict, and tables.tex over all of them; and
@@ -21,7 +21,7 @@ from pathlib import Path
 
 from vlgs.config import split_override
 from vlgs.tables.registry import choose, load_tables
-from vlgs.tables.runs import compare, read_runs
+from vlgs.tables.runs import compare, read_runs, require_format
 from vlgs.tables.write import write_all
 from vlgs.text import screen
 
@@ -56,10 +56,13 @@ def _compare(folder: Path, given: Mapping[str, str]) -> None:
     """One line per run of a folder."""
     if unknown := sorted(set(given) - {"write"}):
         raise ValueError(f"tables: with a folder, arguments must be write=, got {unknown[0]}")
+    out = Path(given["write"]) if "write" in given else None
+    if out is not None:
+        require_format(out)
     table = compare(read_runs(folder))
     print(table.text())
-    if "write" in given:
-        table.write(Path(given["write"]))
+    if out is not None:
+        table.write(out)
 
 
 if __name__ == "__main__":

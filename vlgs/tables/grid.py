@@ -186,7 +186,9 @@ def caption(filled: Filled) -> str:
         said = "One seed, hence no deviation and no claim."
     else:
         spread = "-".join(str(s) for s in sorted({seeds[0], seeds[-1]}))
-        said = f"Mean +- standard deviation over {spread} seeds; best of a group bold, second underlined."
+        said = f"Mean +- standard deviation over {spread} seeds"
+        # Columns of a table by category are rows of the registry: there is nothing to rank down a column.
+        said += "." if table.by_category else "; best of a group bold, second underlined."
         said += " One seed has no deviation, no rank and makes no claim." * (seeds[0] == 1)
     parts = [table.caption, said]
     if table.same_runs_as and not filled.same_scenes:

@@ -123,18 +123,27 @@ def load_tables(folder: Path = SWEEPS) -> dict[str, Table]:
 
 
 def choose(labels: Sequence[str], tables: Mapping[str, Table]) -> list[Table]:
-    """The tables of that name, with or without ``tab:``; ``all`` is every one.
+    """The tables of that name, with or without ``tab:``; ``all`` is every one. What ends in ``.yaml`` is the file of a table of one's own.
 
     Raises:
-        ValueError: Names the label and lists those that exist.
+        ValueError: Names the label and lists those that exist, or what is wrong with the file.
+        OSError: If the file cannot be read.
     """
-    names = [label.removeprefix("tab:") for label in labels]
+    names = dict.fromkeys(label.removeprefix("tab:") for label in labels)
     if "all" in names:
         return list(tables.values())
+    chosen = []
     for name in names:
-        if name not in tables:
-            raise ValueError(f"tab: must be all or one of {', '.join(tables)}, got {name}")
-    return [tables[name] for name in dict.fromkeys(names)]
+        if name.endswith(".yaml"):
+            chosen.append(load_table(Path(name)))
+            if chosen[-1].label in tables:
+                raise ValueError(f"tab: {name} must have a label of its own, got that of ours")
+        elif name in tables:
+            chosen.append(tables[name])
+        else:
+            known = ", ".join(tables)
+            raise ValueError(f"tab: must be all, one of {known}, or a file of yours, got {name}")
+    return chosen
 
 
 def load_table(path: Path) -> Table:

@@ -15,7 +15,7 @@ from vlgs.identity import PLACES, moves
 from vlgs.known import renamed
 from vlgs.runs import RunFolder
 from vlgs.tables.registry import read_yaml
-from vlgs.text import csv_line, markdown, screen, to_bytes, visible
+from vlgs.text import csv_line, latex, markdown, screen, to_bytes, visible
 
 log = logging.getLogger(__name__)
 
@@ -74,15 +74,20 @@ class RunTable:
         """Write it as the file's name says.
 
         Raises:
-            ValueError: If the name ends neither in .csv nor in .md.
+            ValueError: If the name ends in something else, see `require_format`.
         """
+        require_format(path)
         if path.suffix == ".csv":
             lines = [csv_line(self.head), *map(csv_line, self.rows)]
-        elif path.suffix == ".md":
+        elif path.suffix == ".tex":  # needs booktabs
+            aligned = "".join("r" if name in self.digits else "l" for name in self.head)
+            body = [" & ".join(row) + r" \\" for row in self._printed(latex)]
+            top = " & ".join(map(latex, self.head)) + r" \\"
+            lines = [rf"\begin{{tabular}}{{{aligned}}}", r"\toprule", top, r"\midrule", *body]
+            lines += [r"\bottomrule", r"\end{tabular}"]
+        else:
             cells = [map(markdown, self.head), ["---"] * len(self.head), *self._printed(markdown)]
             lines = ["| " + " | ".join(row) + " |" for row in cells]
-        else:
-            raise ValueError(f"tables: write must end in .csv or .md, got {path.name}")
         write_atomically(path, to_bytes("\n".join([*lines, ""])))
 
     def _printed(self, neutral: Any) -> list[list[str]]:
@@ -97,6 +102,16 @@ class RunTable:
             ]
             for row in self.rows
         ]
+
+
+def require_format(path: Path) -> None:
+    """Do nothing if a table can be written to a file of this name.
+
+    Raises:
+        ValueError: If it ends in something else.
+    """
+    if path.suffix not in (".csv", ".md", ".tex"):
+        raise ValueError(f"tables: write must end in .csv, .md or .tex, got {path.name}")
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -176,6 +191,11 @@ def _leaves(node: Any, key: str, depth: int = 0) -> Iterable[tuple[str, Any]]:
 
 def _shown(group: str, value: Any) -> str:
     """A value; of a class in the configuration the option that it is, where that is but one."""
+    if isinstance(value, list) and any(isinstance(v, dict) for v in value):  # stages of a method
+        return "+".join(
+            str(v.get("_target_", v)).rpartition(".")[2] if isinstance(v, dict) else str(v)
+            for v in value
+        )[:80]
     if isinstance(value, (list, dict)):
         return f"{len(value)} entries" if len(value) > 8 else ",".join(f"{v!s:.40}" for v in value)
     text = str(value)

@@ -88,7 +88,8 @@ class Associate:
             views = view_of_mask(scene, place)
             groups = group_masks(of_level, views, self.overlaps)
             seen = _views_per_group(groups, views)
-            kept = (groups >= 0) & (seen[groups] >= self.min_views)
+            kept = groups >= 0
+            kept[groups >= 0] = seen[groups[groups >= 0]] >= self.min_views
             _, number = torch.unique(groups[kept], return_inverse=True)
             found[kept] = number + found.max() + 1
         if found.max() < 0:

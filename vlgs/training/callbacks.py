@@ -1,5 +1,6 @@
 """Callbacks of training: densification, checkpoints, the progress bar, log.csv, and stopping on Ctrl-C."""
 
+import logging
 import math
 import os
 import signal
@@ -25,9 +26,14 @@ from vlgs.training.lightning import VLGSModule
 from vlgs.training.silence import silence
 from vlgs.training.state import capture
 
+log = logging.getLogger(__name__)
+
 
 class Densification(AfterStep):
     """Clone, split, prune and reset, from the two real views of each iteration (conf/README.md, D.10 and D.11)."""
+
+    full = False
+    """Whether `gaussians.max_count` was told to have stopped growth."""
 
     def after_step(self, module: TrainedModule) -> None:
         """Gather the screen gradients of this iteration, then change the Gaussians when it is time."""
@@ -44,7 +50,7 @@ class Densification(AfterStep):
         if done == module.settings.iterations:
             return  # no iteration would train what comes, or bring back what is made transparent
         if config.densify.densifies_at(done):
-            densify(
+            did = densify(
                 module.model.splats,
                 module.optimizer,
                 state,
@@ -55,6 +61,13 @@ class Densification(AfterStep):
                 densifying.centers,
                 module.model.attributes,
             )
+            if did.refused and not self.full:
+                self.full = True
+                log.warning(
+                    "iteration %d: gaussians.max_count=%d leaves no room for %d of the Gaussians that should be split or cloned;"
+                    " raise it for finer detail",
+                    done, config.max_count, did.refused,
+                )  # fmt: skip
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)
 

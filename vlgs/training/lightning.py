@@ -163,8 +163,10 @@ class VLGSModule(L.LightningModule):
             if group["name"] == "means":
                 group["lr"] = self.settings.means_rate(step) * self.densifying.extent
             elif group["name"] in self.model.attributes:
-                rate = self.model.attributes[group["name"]].rate
-                group["lr"] = rate * self.settings.decay(group["name"], step)
+                row = self.model.attributes[group["name"]]
+                # A copy learns like its original (`vlgs.gaussians.attributes`).
+                name = row.start if isinstance(row.start, str) else row.name
+                group["lr"] = row.rate * self.settings.decay(name, step)
         highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.densifying.config.init is not None or "shN" in self.settings.freeze

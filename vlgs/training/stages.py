@@ -215,6 +215,13 @@ class Train:
     def __post_init__(self) -> None:
         require_range("train", *SHARES, share=self.share)
 
+    @property
+    def demands(self) -> Sequence[Demand]:
+        """That nobody expects an indicator to be learned where it is frozen at its first value."""
+        frozen = "indicator_logits" in self.freeze
+        asker, why = "a stage that freezes indicator_logits", "as nothing trains it"
+        return (Demand(asker, "indicator", "untrained", why),) if frozen else ()
+
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
         """See `Stage`. Without masks, and without colour to train, the model stays as it starts."""
         models = {}

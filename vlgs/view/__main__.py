@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vlgs.extras import require_extra
-from vlgs.opened.commands import add_words, command, new_parser, opened
+from vlgs.opened.commands import add_words, command, given_to_open, new_parser, opened
 from vlgs.text import screen
 from vlgs.values import require_range
 
@@ -100,9 +100,7 @@ def serve(shown: list["Shown"], args: argparse.Namespace) -> None:
     from vlgs.view.server import Address, Server
     from vlgs.view.watch import Watch
 
-    names = ("vocabulary", "text", "template", "within")
-    words = {name: getattr(args, name) for name in names}
-    watch = Watch(shown, partial(open_run, **words))
+    watch = Watch(shown, partial(open_run, **given_to_open(args)))
     server = Server(shown, Address(args.host, args.port), args.word)
     try:
         names = " and ".join(str(folder) for folder in args.runs)

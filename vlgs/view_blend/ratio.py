@@ -1,11 +1,13 @@
 """What is blended, and how the ratio k is drawn. k is the weight of view 1 everywhere."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from vlgs.demands import Demand
 from vlgs.values import require_choice, require_range
 
 Convention = Literal["consistent", "paper"]
@@ -46,6 +48,12 @@ class ViewBlend(ABC):
         require_choice(who, "pairs", self.pairs, ("uniform", "neighbours"))
         if self.neighbours < 1:
             raise ValueError(f"{who}: neighbours must be at least 1, got {self.neighbours}")
+
+    @property
+    def demands(self) -> Sequence[Demand]:
+        """A term of the loss that looks at blended views, unless there are none."""
+        why = "as no other loss looks at it; blend=none has none"
+        return (Demand("a blended view", "loss", "blends", why),) if self.active else ()
 
     @property
     def active(self) -> bool:

@@ -97,7 +97,7 @@ def open_dense(folder: Path) -> tuple[DenseFolder | None, tuple[Fault, ...]]:
 def _class_faults(file: str, listed: Mapping[str, dict]) -> Iterator[Fault]:
     names = []
     for key, entry in listed.items():
-        if not re.fullmatch("[0-9]{1,9}", key) or int(key) >= IGNORE_ID:
+        if not re.fullmatch("0|[1-9][0-9]{0,8}", key) or int(key) >= IGNORE_ID:
             yield Fault(file, f"class id must be 0 to {IGNORE_ID - 1}, got {key[:40]!r}")
         name, kind, ignored = (
             entry.get("name"),

@@ -62,7 +62,12 @@ def read_images(path: Path) -> tuple[SparseImage, ...]:
             )
         observations = _parse(path, at + 2, points, _count_seen)
         images.append(
-            _parse(path, at + 1, lines[at], lambda words, n=observations: _image(words, n))
+            _parse(
+                path,
+                at + 1,
+                lines[at],
+                lambda words, line=lines[at], n=observations: _image(words, line, n),
+            )
         )
         at += 2
     return tuple(images)
@@ -89,11 +94,11 @@ def read_points(
     return ids, positions, np.array([p[2] for p in points], np.uint8).reshape(-1, 3)
 
 
-def _image(words: list[str], observations: int) -> SparseImage:
+def _image(words: list[str], line: str, observations: int) -> SparseImage:
     if len(words) < 10:
         raise ValueError(f"image must be 10 words, got {len(words)}")
     pose = tuple(map(float, words[1:8]))
-    name = " ".join(words[9:])
+    name = line.strip().split(maxsplit=9)[9]  # blanks within it as they are
     return SparseImage(_whole(words[0]), _whole(words[8]), name, pose[:4], pose[4:], observations)
 
 
@@ -122,7 +127,8 @@ def _records(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _lines(path: Path) -> list[str]:
-    return read_text(path).splitlines()
+    # Not splitlines: it takes characters for ends that names of files may have, such as U+2028.
+    return read_text(path).removesuffix("\n").split("\n")
 
 
 def _is_blank(line: str) -> bool:

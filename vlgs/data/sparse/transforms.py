@@ -29,6 +29,7 @@ from vlgs.files import write_atomically
 from vlgs.geometry import quat_to_rotmat, rotmat_to_quat
 
 FILE = "transforms.json"
+_POINTS = "sparse_pc.ply"
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes <-> OpenCV's."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
@@ -83,7 +84,7 @@ def read_transforms(path: Path) -> SparseModel:
 
 
 def write_transforms(path: Path, model: SparseModel, images: str = "images") -> None:
-    """Write nerfstudio's file, and the points beside it as ``sparse_pc.ply``.
+    """Write nerfstudio's file, and the points beside it as ``sparse_pc.ply``: both, or neither.
 
     Args:
         path: The JSON; its folder must exist.
@@ -91,9 +92,15 @@ def write_transforms(path: Path, model: SparseModel, images: str = "images") -> 
         images: Folder of the photographs, relative to the file's.
 
     Raises:
-        ValueError: If a camera's model has no place in the format.
+        ValueError: If a camera's model has no place in the format, or there are points beside the file that are not its own.
         OSError: If a file cannot be written.
     """
+    points = path.with_name(_POINTS)
+    known = points.exists() or points.is_symlink()
+    if len(model.points) and known and not _names_points(path):
+        raise ValueError(
+            f"transforms {path}: {_POINTS} beside it must not be there, got one that is not its own; a folder of its own will do"
+        )
     lenses = {camera.camera_id: _written_lens(path, camera) for camera in model.cameras}
     frames = []
     for image in model.images:
@@ -118,10 +125,24 @@ def write_transforms(path: Path, model: SparseModel, images: str = "images") -> 
             rows[channel] = model.point_colors[:, column]
         stream = io.BytesIO()
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
-        write_atomically(path.parent / "sparse_pc.ply", stream.getvalue())
-        content["ply_file_path"] = "sparse_pc.ply"
+        write_atomically(points, stream.getvalue())
+        content["ply_file_path"] = _POINTS
     content["frames"] = frames
-    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+    try:
+        write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+    except OSError:
+        if len(model.points) and not known:
+            points.unlink()
+        raise
+
+
+def _names_points(path: Path) -> bool:
+    """Whether a file that is there says that the points beside it are its own."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.get("ply_file_path") == _POINTS
 
 
 def _name(path: Path, number: int, frame: Mapping[str, Any]) -> PurePosixPath:
