@@ -78,6 +78,15 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(camera.viewmat, camera.K * scale[:, None], width, height)
 
 
+def subsample_camera(camera: Camera, step: int) -> Camera:
+    """The camera whose pixels are every `step`-th of every `step`-th row, from the first: their centres see where they saw before."""
+    rows, columns = -(-camera.height // step), -(-camera.width // step)
+    K = camera.K / step
+    K[2, 2] = 1
+    K[:2, 2] += 0.5 - 0.5 / step
+    return Camera(camera.viewmat, K, columns, rows)
+
+
 def scene_extent(viewmats: Float[Tensor, "v 4 4"]) -> float:
     """1.1 x the largest distance of a camera from the mean camera centre (3DGS); 1.0 for a single camera.
 

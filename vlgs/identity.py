@@ -80,6 +80,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.clear_air": False,
     "gaussians.near_share": 0,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
+    **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),
     "query.masks": None,
     "stages": None,
     "trainer.color_decay": 1,

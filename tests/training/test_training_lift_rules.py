@@ -1,5 +1,6 @@
 """Every rule of lifting against a loop over pixels, whose weights come from the dense reference, in float64."""
 
+from copy import copy
 from dataclasses import replace
 
 import pytest
@@ -20,7 +21,7 @@ from vlgs.ops.pixel_weights import PixelWeights, pixel_weights
 from vlgs.ops.project import project
 from vlgs.ops.rasterize_reference import rasterize
 from vlgs.training.lift_rules import Direction, LiftRule, Mean, Robust, Squared, TopK
-from vlgs.training.mask_weights import mask_weights, masked_views
+from vlgs.training.mask_weights import Share, mask_weights, masked_views
 from vlgs.types import ChannelGroup, RasterConfig, Scene
 
 RULES = (Mean(), Squared(), TopK(3), Direction(), Robust(steps=6))
@@ -88,7 +89,7 @@ def by_loop(rule: LiftRule, images: list[Tensor], masks: list[Tensor], vectors: 
 def test_a_rule_is_the_loop_over_pixels(model: SplatModel, tiny_scene: Scene, rule: LiftRule):
     scene = replace(tiny_scene, train=tiny_scene.train[:2])
     vectors = normalize(torch.randn(len(scene.mask_vectors), 5, dtype=torch.float64), dim=1)
-    masks = [index for _, index in masked_views(scene)]
+    masks = [view.index for view in masked_views(scene)]
     want = by_loop(rule, dense_weights(model, scene), masks, vectors)
     got = rule.combine(mask_weights(model, scene, share=rule.share), vectors)
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
@@ -127,11 +128,39 @@ def test_one_pixel_worked_by_hand():
     assert torch.equal(Squared().share(part), part.weight**2)
 
 
+@pytest.mark.parametrize("share", [None, Squared().share], ids=["backward", "one by one"])
+def test_sampled_pixels_weigh_what_they_weigh_among_all(
+    model: SplatModel, tiny_scene: Scene, share: Share | None
+):
+    model = copy(model)
+    model.raster = replace(model.raster, fov_margin=1e6)  # what is clamped depends on the image
+    width, height = tiny_scene.train[0].camera.width, tiny_scene.train[0].camera.height
+    pixels = -(-width // 3) * -(-height // 3)
+    views = list(masked_views(tiny_scene, pixels=pixels))
+    assert all(view.step == 3 and view.index.numel() <= pixels for view in views)
+    got = mask_weights(model, tiny_scene, share=share, pixels=pixels)
+    want = torch.zeros(model.count, len(tiny_scene.mask_vectors), dtype=torch.float64)
+    for weights, view, whole in zip(
+        dense_weights(model, tiny_scene), views, masked_views(tiny_scene), strict=True
+    ):
+        assert torch.equal(view.index, whole.index[::3, ::3])
+        weights = weights.unflatten(0, (height, width))[::3, ::3][view.index >= 0]
+        weights = weights if share is None else weights.square()
+        want.index_add_(1, view.index[view.index >= 0].long(), weights.T.contiguous())
+    found = torch.zeros_like(want)
+    found[got.gaussian, got.mask] = got.weight
+    torch.testing.assert_close(found, want, rtol=1e-5, atol=1e-5)
+    assert torch.equal(mask_weights(model, tiny_scene, share=share, pixels=width * height).weight, mask_weights(model, tiny_scene, share=share).weight)  # fmt: skip
+
+
 def test_each_level_is_lifted_from_its_own_masks(model: SplatModel, tiny_scene: Scene):
     scene = replace(tiny_scene, train=tiny_scene.train[:2])
     views = [
-        replace(view, read_masks=lambda index=index: torch.stack([index.flip(0), index], dim=-1))
-        for view, index in masked_views(scene)
+        replace(
+            view,
+            read_masks=lambda index=masked.index: torch.stack([index.flip(0), index], dim=-1),
+        )
+        for view, masked in zip(scene.train, masked_views(scene), strict=True)
     ]
     joint = replace(scene, train=tuple(views), mask_levels=2)
     alone, second = mask_weights(model, scene), mask_weights(model, joint, level=1)

@@ -1,5 +1,6 @@
 """Language as a linear system, against the dense weights of the reference in float64."""
 
+from copy import copy
 from dataclasses import replace
 
 import pytest
@@ -30,7 +31,7 @@ def scene(tiny_scene: Scene) -> Scene:
 
 def system(model: SplatModel, scene: Scene, absent: float) -> tuple[Tensor, Tensor, Tensor]:
     """Weights of all pixels [p, n], which mask each shows, and how much it counts."""
-    indices = [index for _, index in masked_views(scene)]
+    indices = [view.index for view in masked_views(scene)]
     trust = []
     for view, index in zip(scene.train, indices, strict=True):
         there = view.read_valid() if view.read_valid is not None else torch.ones_like(index)
@@ -91,6 +92,34 @@ def test_enough_steps_solve_the_system(
     assert cost(want) < costs[4] < 0.95 * costs[0]
 
 
+def test_large_views_are_solved_at_some_of_their_pixels(model: SplatModel, scene: Scene):
+    model = copy(model)
+    model.raster = replace(model.raster, fov_margin=1e6)  # what is clamped depends on the image
+    vectors = vectors_of(scene)
+    weights, index, trust = system(model, scene, 1.0)
+    step = 2
+    kept = torch.cat(
+        [
+            torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
+            .index_put((torch.arange(0, view.camera.height, step)[:, None], torch.arange(0, view.camera.width, step)), torch.tensor(True))
+            .flatten()
+            for view in scene.train
+        ]
+    )  # fmt: skip
+    weights, index, trust = weights[kept], index[kept], trust[kept]
+    pixels = int(kept.sum()) // 2
+    solver = Solve(steps=40, prior=0.1, pixels=pixels)
+    start = solver.combine(mask_weights(model, scene, pixels=pixels), vectors)
+    normal = weights.T @ (trust[:, None] * weights)
+    held = 0.1 * torch.diag(normal.sum(1))
+    targets = vectors[index.clamp_min(0).long()] * (index >= 0)[:, None]
+    want = torch.linalg.lstsq(
+        normal + held, weights.T @ (trust[:, None] * targets) + held @ start, driver="gelsd"
+    ).solution
+    got = solver.refine(model, scene, 0, vectors, start)
+    torch.testing.assert_close(weights @ got, weights @ want, rtol=1e-4, atol=1e-4)
+
+
 def test_conjugate_gradients_solve_as_many_unknowns_in_as_many_steps():
     generator = torch.Generator().manual_seed(0)
     root = torch.randn(6, 6, dtype=torch.float64, generator=generator)
@@ -110,5 +139,7 @@ def test_options_are_the_defaults():
     assert instantiate(composed("method=best").lift) == Solve()
     with pytest.raises(ValueError, match=r"consensus: absent must be 0 to 1, got 1\.5"):
         Consensus(absent=1.5)
+    with pytest.raises(ValueError, match="solve: pixels must be"):
+        Solve(pixels=-1)
     with pytest.raises(ValueError, match="solve: prior must be"):
         Solve(prior=0.0)

@@ -184,12 +184,28 @@ class SplatModel(nn.Module):
         )
 
     def render_values(
-        self, camera: Camera, values: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
+        self,
+        camera: Camera,
+        values: Float[Tensor, "n c"],
+        weight: Float[Tensor, " n"],
+        step: int = 1,
     ) -> Float[Tensor, "h w c"]:
-        """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of Fig. 3."""
+        """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of Fig. 3.
+
+        Args:
+            camera: Of the image.
+            values: One row per Gaussian.
+            weight: In place of the opacity, in [0, 1].
+            step: Of `camera`, where it is every `step`-th pixel of another (`vlgs.geometry.subsample_camera`). They come out as in the other's
+                image, but for Gaussians that `RasterConfig.fov_margin` clamps, as that depends on the image.
+        """
         gaussians = self.gaussians()
         group = ChannelGroup(values, weight, shape=gaussians.language_shape)
-        return self._rasterize(gaussians, [group], camera).images[0]
+        return self._rasterize(gaussians, [group], camera, step).images[0]
+
+    def raster_of(self, step: int) -> RasterConfig:
+        """The constants for every `step`-th pixel of an image: `RasterConfig.eps2d` is in pixels."""
+        return self.raster if step == 1 else replace(self.raster, eps2d=self.raster.eps2d / step**2)
 
     def predict(self, feature: Float[Tensor, "h w c"]) -> Float[Tensor, "h wl t"]:
         """What a rendered map of codes is compared by (`Head.predict`); l mask levels stand beside each other in a row."""
@@ -218,7 +234,9 @@ class SplatModel(nn.Module):
         color, feature = self.fusion(seen, gaussians.features)
         return color.clamp_min(0.0), feature
 
-    def _rasterize(self, gaussians: Gaussians, groups: list[ChannelGroup], camera: Camera):
+    def _rasterize(
+        self, gaussians: Gaussians, groups: list[ChannelGroup], camera: Camera, step: int = 1
+    ):
         return rasterize(
             gaussians.means,
             gaussians.quats,
@@ -228,7 +246,7 @@ class SplatModel(nn.Module):
             camera.K,
             camera.width,
             camera.height,
-            config=self.raster,
+            config=self.raster_of(step),
         )
 
 

@@ -102,8 +102,8 @@ class Associate:
 def view_of_mask(scene: Scene, level: int = 0) -> Int[Tensor, " m"]:
     """Number of the training view of every mask of a level; -1 for those of others."""
     views = torch.full((len(scene.mask_vectors),), -1)
-    for number, (_, index) in enumerate(masked_views(scene, level)):
-        views[index[index >= 0].long()] = number
+    for number, view in enumerate(masked_views(scene, level)):
+        views[view.index[view.index >= 0].long()] = number
     return views
 
 

@@ -68,6 +68,16 @@ class Refining(Protocol):
         ...
 
 
+@runtime_checkable
+class Sampling(Protocol):
+    """A rule that does not look at all pixels of a large view."""
+
+    @property
+    def pixels(self) -> int:
+        """Most of a view (`vlgs.training.mask_weights.masked_views`)."""
+        ...
+
+
 @dataclass(frozen=True)
 class Mean:
     """``sum w H / sum w`` (LUDVIG, Marrie et al., ICCV 2025; Occam's LGS, Cheng et al., 2024, where the centre's pixel stands for all)."""
@@ -225,7 +235,8 @@ def lift_by(rule: LiftRule, module: VLGSModule) -> None:
     vectors = model.head.targets(scene.mask_vectors.to(model.splats["features"]))
     codes = []
     for level in range(model.levels):
-        made = rule.combine(mask_weights(model, scene, level, rule.share), vectors)
+        pixels = rule.pixels if isinstance(rule, Sampling) else None
+        made = rule.combine(mask_weights(model, scene, level, rule.share, pixels), vectors)
         if isinstance(rule, Refining):
             made = rule.refine(model, scene, level, vectors, made)
         codes.append(made)

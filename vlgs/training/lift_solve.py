@@ -9,15 +9,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fields.splat import SplatModel
 from vlgs.heads.threads import one_thread
-from vlgs.objectives.targets import covered
 from vlgs.training.lift_rules import Consensus
-from vlgs.training.mask_weights import masked_views
-from vlgs.types import Camera, Scene
+from vlgs.training.mask_weights import MaskedView, masked_views
+from vlgs.types import Scene
 from vlgs.values import require_range
 
 
@@ -30,16 +29,19 @@ class Solve(Consensus):
     (Xiong et al., 2025) sees lifting as least squares too, and takes the weighted mean for its solution.
 
     Raises:
-        ValueError: If `absent` is not in [0, 1], `prior` is not positive, or `steps` is negative.
+        ValueError: If `absent` is not in [0, 1], `prior` is not positive, or `steps` or `pixels` is negative.
     """
 
     steps: int = 4
     """Of conjugate gradients, each a render of every view and its backward pass; 0: `Consensus`."""
     prior: float = 0.1
+    pixels: int = 250_000
+    """Most of a view; of a larger one every n-th of every n-th row counts, for the smallest n that is enough. 0: all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_range("solve", 0, 10_000, steps=self.steps)
+        require_range("solve", 0, 2**31, pixels=self.pixels)
         require_range("solve", 1e-6, 1e6, prior=self.prior)
 
     def refine(
@@ -56,7 +58,7 @@ class Solve(Consensus):
         with torch.no_grad():
             weight = model.fuse().language_weight
         weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
-        system = _System(model, weight, scene, level, vectors, self.absent)
+        system = _System(model, weight, scene, level, vectors, self.absent, self.pixels)
         mass = system.gathered(torch.ones_like(start[:, :1]))
         scale = 1 / ((1 + self.prior) * mass).clamp_min(torch.finfo(mass.dtype).tiny)
 
@@ -116,6 +118,7 @@ class _System:
     level: int
     vectors: Float[Tensor, "m t"]
     absent: float
+    pixels: int
 
     def gathered(self, codes: Float[Tensor, "n t"]) -> Float[Tensor, "n t"]:
         """``W^T T W codes``."""
@@ -127,10 +130,11 @@ class _System:
 
     def _back(self, codes: Float[Tensor, "n t"], wanted: bool) -> Float[Tensor, "n t"]:
         total = torch.zeros_like(codes)
-        for camera, index, trust in self._looks():
+        for view, trust in self._looks():
+            index = view.index
             values = codes.detach().requires_grad_()
             with torch.enable_grad():
-                image = self.model.render_values(camera, values, self.weight)
+                image = self.model.render_values(view.camera, values, self.weight, view.step)
                 error = image.detach()
                 if wanted:
                     error = (
@@ -139,11 +143,11 @@ class _System:
                 total += torch.autograd.grad(image, values, trust * error)[0]
         return total
 
-    def _looks(self) -> Iterator[tuple[Camera, Int[Tensor, "h w"], Float[Tensor, "h w 1"]]]:
-        """Of each view the masks it shows and how much a pixel counts."""
-        for view, index in masked_views(self.scene, self.level):
-            masked = (index >= 0)[..., None]
+    def _looks(self) -> Iterator[tuple[MaskedView, Float[Tensor, "h w 1"]]]:
+        """Every view and how much its pixels count."""
+        for view in masked_views(self.scene, self.level, self.pixels):
+            masked = (view.index >= 0)[..., None]
             trust = torch.where(masked, 1.0, self.absent).to(self.vectors)
-            if (seen := covered(view)) is not None:
-                trust = trust * (seen[..., None] | masked)
-            yield view.camera, index, trust
+            if view.covered is not None:
+                trust = trust * (view.covered[..., None] | masked)
+            yield view, trust

@@ -6,17 +6,19 @@ embeddings is ever made.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import ceil, sqrt
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from vlgs.fields.splat import SplatModel
+from vlgs.geometry import subsample_camera
 from vlgs.objectives.targets import covered
 from vlgs.ops.pixel_weights import PixelWeights, pixel_weights
 from vlgs.ops.project import project
-from vlgs.types import Scene, View
+from vlgs.types import Camera, Scene
 
 UNSEEN = -2
 """In place of a mask's row, where a photograph shows nothing."""
@@ -28,10 +30,23 @@ Share = Callable[[PixelWeights], Float[Tensor, " z"]]
 
 
 @dataclass(frozen=True)
+class MaskedView:
+    """A training view that has masks, or every `step`-th pixel of every `step`-th row of it."""
+
+    camera: Camera
+    index: Int[Tensor, "h w"]
+    """Row of `Scene.mask_vectors` per pixel, -1 where no mask lies."""
+    covered: Bool[Tensor, "h w"] | None
+    """Pixels that the photograph covers; None for all."""
+    step: int
+
+
+@dataclass(frozen=True)
 class MaskWeights:
     """Sums of every pair of a Gaussian and a mask that have one, by Gaussian and then by mask."""
 
     gaussian: Int[Tensor, " z"]
+    """int32, as `mask`: large scenes have hundreds of millions of pairs."""
     mask: Int[Tensor, " z"]
     """Row of `Scene.mask_vectors`."""
     weight: Float[Tensor, " z"]
@@ -54,7 +69,8 @@ class MaskWeights:
             weight: In place of `weight`.
         """
         used = self.weight if weight is None else weight
-        starts = torch.searchsorted(self.gaussian, torch.arange(self.gaussians))
+        rows = torch.arange(self.gaussians, dtype=self.gaussian.dtype)
+        starts = torch.searchsorted(self.gaussian, rows, out_int32=self.mask.dtype == torch.int32)
         return embedding_bag(
             self.mask, vectors, starts, mode="sum", per_sample_weights=used.to(vectors)
         )
@@ -67,7 +83,11 @@ class MaskWeights:
 
 @torch.no_grad()
 def mask_weights(
-    model: SplatModel, scene: Scene, level: int = 0, share: Share | None = None
+    model: SplatModel,
+    scene: Scene,
+    level: int = 0,
+    share: Share | None = None,
+    pixels: int | None = None,
 ) -> MaskWeights:
     """The sums over all training views, with the weights that blend language.
 
@@ -76,15 +96,18 @@ def mask_weights(
         scene: Whose masks.
         level: Place of the mask level, where `Scene.mask_levels` are several.
         share: What is summed of each pixel's weights; None: the weight itself, by the rasterizer's own backward pass.
+        pixels: Most of a view, see `masked_views`.
     """
     weight = model.fuse().language_weight
     weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
+    masks = max(1, len(scene.mask_vectors))
     found: list[Tensor] = []
     values: list[Tensor] = []
     unmasked = torch.zeros_like(weight)
-    for view, index in masked_views(scene, level):
-        if (seen := covered(view)) is not None:
-            index = torch.where(seen | (index >= 0), index, UNSEEN)
+    for view in masked_views(scene, level, pixels):
+        index = view.index
+        if view.covered is not None:
+            index = torch.where(view.covered | (index >= 0), index, UNSEEN)
         numbers, local = torch.unique(index, return_inverse=True)
         if share is None:
             sums = _by_backward(model, view, weight, local, len(numbers))
@@ -93,25 +116,52 @@ def mask_weights(
         unmasked += sums[:, (numbers < 0) & (numbers != UNSEEN)].sum(1)
         sums[:, numbers < 0] = 0
         pairs = sums.nonzero()
-        found.append(torch.stack([pairs[:, 0], numbers[pairs[:, 1]].long()]))
+        found.append(pairs[:, 0] * masks + numbers[pairs[:, 1]])
         values.append(sums[pairs[:, 0], pairs[:, 1]])
-    pairs = torch.cat(found, dim=1) if found else torch.zeros(2, 0, dtype=torch.long)
-    summed = torch.cat(values) if values else weight.new_zeros(0)
-    order = (pairs[0] * max(1, len(scene.mask_vectors)) + pairs[1]).argsort(stable=True)
-    return MaskWeights(pairs[0][order], pairs[1][order], summed[order], unmasked)
+    return MaskWeights(*_sorted(found, values, masks, weight), unmasked)
 
 
-def masked_views(scene: Scene, level: int = 0) -> Iterator[tuple[View, Int[Tensor, "h w"]]]:
-    """The training views that have masks, with those of one level."""
+def _sorted(
+    found: list[Tensor], values: list[Tensor], masks: int, like: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gaussian, mask and weight of each pair, `found` as one number, in order. Empties the lists: these are the most memory that lifting takes."""
+    if not found:
+        none = torch.zeros(0, dtype=torch.int32)
+        return none, none, like.new_zeros(0)
+    weight = torch.cat(values)
+    values.clear()
+    pairs = torch.cat(found)
+    found.clear()
+    pairs, order = pairs.sort(stable=True)
+    weight = weight[order]
+    del order
+    gaussian = pairs.div(masks, rounding_mode="floor").int()
+    return gaussian, pairs.remainder_(masks).int(), weight
+
+
+def masked_views(scene: Scene, level: int = 0, pixels: int | None = None) -> Iterator[MaskedView]:
+    """The training views that have masks, with those of one level.
+
+    Args:
+        scene: Whose views.
+        level: Place of the mask level.
+        pixels: Most of a view; a larger one is given by every n-th pixel of every n-th row, for the smallest n. None or 0: all.
+    """
     for view in scene.train:
         if view.read_masks is not None:
             index = view.read_masks()
-            yield view, index if index.dim() == 2 else index[..., level]
+            index = index if index.dim() == 2 else index[..., level]
+            step = max(1, ceil(sqrt(index.numel() / pixels))) if pixels else 1
+            seen, camera = covered(view), view.camera
+            if step > 1:
+                index, camera = index[::step, ::step], subsample_camera(camera, step)
+                seen = None if seen is None else seen[::step, ::step]
+            yield MaskedView(camera, index, seen, step)
 
 
 def _by_backward(
     model: SplatModel,
-    view: View,
+    view: MaskedView,
     weight: Float[Tensor, " n"],
     local: Int[Tensor, "h w"],
     count: int,
@@ -123,14 +173,14 @@ def _by_backward(
         inside = (local[..., None] == numbers).to(weight)
         values = weight.new_zeros(len(weight), len(numbers), requires_grad=True)
         with torch.enable_grad():
-            image = model.render_values(view.camera, values, weight)
+            image = model.render_values(view.camera, values, weight, view.step)
             parts.append(torch.autograd.grad(image, values, inside)[0])
     return torch.cat(parts, dim=1)
 
 
 def _one_by_one(
     model: SplatModel,
-    view: View,
+    view: MaskedView,
     weight: Float[Tensor, " n"],
     local: Int[Tensor, "h w"],
     count: int,
@@ -140,9 +190,10 @@ def _one_by_one(
     quats, scales = gaussians.quats, gaussians.scales
     if (own := gaussians.language_shape) is not None:
         quats, scales = own.quats, own.scales
-    splats = project(gaussians.means, quats, scales, view.camera, model.raster)
+    raster = model.raster_of(view.step)
+    splats = project(gaussians.means, quats, scales, view.camera, raster)
     sums = torch.zeros(len(weight) * count, dtype=torch.float64)
-    for part in pixel_weights(splats, weight, view.camera, model.raster):
+    for part in pixel_weights(splats, weight, view.camera, raster):
         sums.index_add_(0, part.gaussian * count + flat[part.pixel], share(part))
     return sums.view(-1, count).to(weight)
 
