@@ -91,7 +91,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "trainer.rates_for": None,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while
-they have; the default may be another. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""
+they have; the default may be another. What stands in a list counts without its number. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""
 
 
 def _prunes_large(counted: Mapping[str, Any]) -> bool:
