@@ -136,12 +136,12 @@ def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, ca
     assert same(load_scene(**cached, points=7), load_scene(**SMALL, points=7))
     [file] = (tmp_path / "cache").iterdir()
 
-    capture._kept.cache_clear()  # as another process would begin
+    capture._kept_beside.cache_clear()  # as another process would begin
     monkeypatch.setattr(capture, "photograph", lambda *_: pytest.fail("traced again"))
     assert same(traced, load_scene(**cached))
 
     monkeypatch.undo()
-    capture._kept.cache_clear()
+    capture._kept_beside.cache_clear()
     file.write_bytes(file.read_bytes()[:1000])
     assert same(traced, load_scene(**cached))
     assert "could not be read" in caplog.text

@@ -64,15 +64,21 @@ def open_capture(settings: SceneSettings, cache: Path | None = None) -> Capture:
 
     Args:
         settings: Of the scene; its points and faults do not matter here.
-        cache: Folder that keeps photographs between processes; None: those of the last two scenes are kept in memory.
+        cache: Folder that keeps photographs between processes; those of the last scene then stay in memory, else those of the last two.
     """
     same = replace(settings, points=0, faults=NO_NOISE)
-    return _kept(same) if cache is None else _open(same, cache)
+    return _kept(same) if cache is None else _kept_beside(same, cache)
 
 
 @functools.lru_cache(maxsize=2)
 def _kept(settings: SceneSettings) -> Capture:
     return _open(settings, None)
+
+
+@functools.lru_cache(maxsize=1)
+def _kept_beside(settings: SceneSettings, cache: Path) -> Capture:
+    """Three mask levels of one scene share one copy."""
+    return _open(settings, cache)
 
 
 def _open(settings: SceneSettings, cache: Path | None) -> Capture:

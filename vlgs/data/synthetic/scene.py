@@ -68,28 +68,29 @@ def load_scene(
     folder = None if cache is None else Path(cache)
     capture = open_capture(settings, folder)
     world = capture.world
-    indices, vectors, offset = {}, [], 0
+    readers, vectors, areas, offset = {}, [], [], 0
     for shot in capture.train:
         masks = _masks(settings, world, shot.photo, shot.number, level)
-        indices[shot.name] = np.where(masks.index >= 0, masks.index + offset, -1).astype(np.int32)
+        count = masks.vectors.shape[0]
+        # Those of hundreds of large photographs are gigabytes, and a view has few masks.
+        small = np.int16 if count <= np.iinfo(np.int16).max else np.int32
+        readers[shot.name] = partial(_rows, masks.index.astype(small), offset)
         vectors.append(masks.vectors)
-        offset += masks.vectors.shape[0]
-    areas = np.zeros(offset)
-    for index in indices.values():
-        areas += np.bincount(index[index >= 0], minlength=offset)
+        areas.append(np.bincount(masks.index[masks.index >= 0], minlength=count))
+        offset += count
     cloud = [
         view_points(world, shot.camera, shot.photo, count, _draws(settings, shot))
         for shot, count in zip(capture.train, _shares(points, train_views), strict=True)
     ]
     return Scene(
         name=file.name,
-        train=tuple(_view(world, shot, indices[shot.name]) for shot in capture.train),
+        train=tuple(_view(world, shot, readers[shot.name]) for shot in capture.train),
         test=tuple(_view(world, shot, None) for shot in capture.test),
         split="synthetic",
         points=torch.cat([xyz for xyz, _ in cloud]),
         point_colors=torch.cat([rgb for _, rgb in cloud]),
         mask_vectors=torch.from_numpy(np.concatenate(vectors)),
-        mask_areas=torch.from_numpy(areas).float(),
+        mask_areas=torch.from_numpy(np.concatenate(areas)).float(),
         classes=world.classes,
         class_kinds={thing.name: thing.kind for thing in world.things if thing.masked},
         vocabulary=vocabulary(world.classes),
@@ -141,7 +142,7 @@ def _key(settings: SceneSettings, number: int) -> tuple[int, ...]:
     return settings.seed, place, number
 
 
-def _view(world: World, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> View:
+def _view(world: World, shot: Shot, read_masks: Callable[[], Int[Tensor, "h w"]] | None) -> View:
     # Labels are made when they are asked for: those of hundreds of large photographs would be gigabytes.
     part = shot.photo.part
     asked = {world.classes.index(t.name): t.name for t in world.things if not t.background}
@@ -154,7 +155,7 @@ def _view(world: World, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> Vie
         name=shot.name,
         camera=shot.camera,
         read_image=_reader(shot.photo.image),
-        read_masks=None if index is None else _reader(index),
+        read_masks=read_masks,
         read_object_labels=objects,
         read_dense_labels=lambda: dense_labels(world.class_of_part[part]),
     )
@@ -163,6 +164,12 @@ def _view(world: World, shot: Shot, index: Int[np.ndarray, "h w"] | None) -> Vie
 def _reader(array: np.ndarray) -> Callable[[], Tensor]:
     """A reader that hands out copies, so that nobody can change what the next caller gets."""
     return lambda: torch.from_numpy(array.copy())
+
+
+def _rows(index: Int[np.ndarray, "h w"], offset: int) -> Int[Tensor, "h w"]:
+    """Rows of `Scene.mask_vectors` of the masks of a view, whose own begin at `offset`."""
+    rows = torch.from_numpy(index.astype(np.int32))
+    return torch.where(rows >= 0, rows + offset, -1)
 
 
 def _shares(total: int, parts: int) -> list[int]:
