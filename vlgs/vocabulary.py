@@ -1,18 +1,16 @@
 """Vectors of words for `data.vocabulary`: `python -m vlgs.vocabulary words.txt SCENE/language_features/vocabulary.npz`."""
 
 import argparse
-import io
 import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
+from vlgs.data.language import write_vocabulary
 from vlgs.data.untrusted.text import read_text
-from vlgs.files import write_atomically
 from vlgs.queries.relevancy import CANONICAL_NEGATIVES
 from vlgs.queries.text import CLIP_MODEL, ClipText, TextEncoder
+from vlgs.types import Vocabulary
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -47,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         words = read_words(args.words)
         if not args.no_negatives:
             words += [word for word in CANONICAL_NEGATIVES if word not in words]
-        write_vocabulary(args.out, words, ClipText(model=args.model), args.template)
+        encode_words(args.out, words, ClipText(model=args.model), args.template)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     print(f"{len(words)} words: {args.out}")
@@ -70,7 +68,7 @@ def read_words(path: Path) -> list[str]:
     return words
 
 
-def write_vocabulary(
+def encode_words(
     path: Path, words: Sequence[str], encoder: TextEncoder, template: str = "{}"
 ) -> None:
     """Write an npz of `names` and `embeddings`, as `data.vocabulary` reads it.
@@ -88,10 +86,8 @@ def write_vocabulary(
     if template.count("{}") != 1:
         raise ValueError(f"vocabulary: template must contain {{}} once, got {template!r}")
     vectors = encoder.encode([template.replace("{}", word) for word in words])
-    buffer = io.BytesIO()
-    np.savez(buffer, names=np.array(words), embeddings=vectors.numpy())
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, buffer.getvalue())
+    write_vocabulary(path, Vocabulary(tuple(words), vectors))
 
 
 if __name__ == "__main__":

@@ -222,6 +222,7 @@ def test_rows_that_are_one_run_are_planned_once(table: Table):
     [
         (["scenes=a"], "tab must be given"),
         (["tab=ab-multi", "fast"], "arguments must be KEY=VALUE, got fast"),
+        (["tab=ab-multi", "--config-dir=mine"], "config-dir must be left out"),
         (["tab=ab-mutli"], "tab: must be all, one of"),
         (["tab=ab-multi", "seeds=many"], "seeds must be a count or a list of integers, got many"),
         (["tab=ab-multi", "seeds=0"], "seeds must be given, each once, got none"),

@@ -197,9 +197,9 @@ def test_a_scene_whose_maps_were_never_made_is_one_without_language(scene: Path,
     dense = ("features/encoder=maps", f"features.extractor.encoder.folder={scene / 'maps'}")
     with pytest.raises(FileNotFoundError, match="must be the feature map of photograph"):
         extract(config(scene, None, *QUICK, *dense))
-    assert [path.name for path in (scene / "language_features").iterdir()] == ["features.json"]
+    assert not (scene / "language_features").exists()  # other settings can have the folder
     assert len(load_scene(str(scene)).mask_vectors) == 0
-    extract(config(scene, weights, "features.out=" + str(scene / "others"), *QUICK))
+    extract(config(scene, weights, *QUICK))
 
 
 def test_missing_weights_are_one_error_with_all_of_them(scene: Path):

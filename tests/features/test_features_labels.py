@@ -135,7 +135,9 @@ def test_a_labelled_scene_becomes_one_that_training_reads(tmp_path: Path):
         config = compose("features", overrides=[*given, "progress=false"])
     assert isinstance(instantiate(config.features.extractor), LabelMasks)
     extract(config)
-    scene = load_scene(str(root), vocabulary=str(words))
+    scene = load_scene(str(root))
+    assert scene.vocabulary is not None  # the words went with the maps
+    assert scene.vocabulary.names == ("glass", "wall")
     assert len(scene.mask_vectors) > 0
     assert scene.mask_vectors.shape[1] == 32
     read = scene.train[0].read_masks
@@ -143,3 +145,9 @@ def test_a_labelled_scene_becomes_one_that_training_reads(tmp_path: Path):
     assert read().shape == (HEIGHT, WIDTH)
     settings = (root / "language_features" / "features.json").read_text()
     assert str(tmp_path) not in settings  # what moves a map is content, not a place
+    own = root / "language_features" / "vocabulary.npz"
+    write_words(own, ("glass", "wall", "lemon"))
+    before = own.read_bytes()
+    (root / "language_features" / f"{scene.train[0].name}_s.npy").unlink()
+    extract(config)
+    assert own.read_bytes() == before

@@ -107,6 +107,11 @@ def read(arguments: Sequence[str]) -> Request:
     overrides: list[str] = []
     for argument in arguments:
         key, equals, value = argument.partition("=")
+        if key == "--config-dir":
+            raise ValueError(
+                "ablate: --config-dir must be left out, as a table is written again without it; its rows name classes of one's "
+                f"own, with plugins= (sweeps/README.md), got {argument}"
+            )
         if not equals:
             raise ValueError(f"ablate: arguments must be KEY=VALUE, got {argument}")
         if key in OWN_KEYS:

@@ -23,7 +23,7 @@ from vlgs.data.cache import PixelCache
 from vlgs.data.diagnostics import Fault, FaultList, SceneError, errors, require_sound, warning
 from vlgs.data.images import transparency_warnings
 from vlgs.data.labels import DenseFolder, ObjectFolder, open_labels
-from vlgs.data.language import read_vocabulary
+from vlgs.data.language import VOCABULARY_FILE, read_vocabulary
 from vlgs.data.masks import (
     MaskTable,
     gather_masks,
@@ -226,7 +226,7 @@ def _open_vocabulary(
     source: ColmapSource, masks: MaskTable | None
 ) -> tuple[Vocabulary | None, tuple[Fault, ...]]:
     folder = _feature_folder(source) or source.folder / "language_features"
-    path = _named_or_default(source.vocabulary, folder / "vocabulary.npz", "vocabulary")
+    path = _named_or_default(source.vocabulary, folder / VOCABULARY_FILE, "vocabulary")
     if path is None:
         return None, ()
     try:

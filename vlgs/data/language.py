@@ -18,6 +18,8 @@ from vlgs.data.untrusted.text import read_json
 from vlgs.files import write_atomically
 from vlgs.types import Vocabulary
 
+VOCABULARY_FILE = "vocabulary.npz"
+"""Words and their vectors, in a folder of language maps."""
 LEVELS = 4
 
 _VOCABULARY = "an npz with names and embeddings or a JSON {name: vector}"
@@ -163,6 +165,21 @@ def read_vocabulary(path: Path) -> Vocabulary:
             Fault(str(path), "embeddings must be finite and not zero, got rows that are not")
         )
     return Vocabulary(names, torch.from_numpy((vectors / norms).astype(np.float32)))
+
+
+def write_vocabulary(path: Path, vocabulary: Vocabulary) -> None:
+    """Write what `read_vocabulary` reads, whole or not at all.
+
+    Args:
+        path: Of an npz; its folder must exist.
+        vocabulary: Words and their vectors.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    stream = io.BytesIO()
+    np.savez(stream, names=np.array(vocabulary.names), embeddings=vocabulary.vectors.numpy())
+    write_atomically(path, stream.getvalue())
 
 
 def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray]:

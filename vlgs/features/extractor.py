@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from vlgs.features.masks import Mask, paint
+from vlgs.types import Vocabulary
 
 LEVELS = 4
 """0 default, 1 subpart, 2 part, 3 whole: the order of LangSplat's maps."""
@@ -45,6 +46,13 @@ class Extractor(Protocol):
             ValueError: If the photograph cannot be described.
         """
         ...
+
+
+@runtime_checkable
+class KnowsWords(Protocol):
+    """An extractor whose vectors lie in the space of words that it was given: what can be asked of its maps."""
+
+    vocabulary: Vocabulary
 
 
 @runtime_checkable

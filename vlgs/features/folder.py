@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from vlgs.data.language import MaskFiles, find_mask_files
+from vlgs.data.language import VOCABULARY_FILE, MaskFiles, find_mask_files, write_vocabulary
 from vlgs.data.untrusted.text import read_json
 from vlgs.features.extractor import LEVELS, MaskFeatures
 from vlgs.files import write_atomically
+from vlgs.types import Vocabulary
 
 SETTINGS = "features.json"
 
@@ -80,6 +81,11 @@ class FeatureFolder:
         files.ids.unlink(missing_ok=True)
         write_atomically(files.vectors, _npy(features.vectors))
         write_atomically(files.ids, _npy(features.ids.astype(np.float32)))
+
+    def write_words(self, vocabulary: Vocabulary) -> None:
+        """Write what can be asked of these maps; a file that is there, such as one of more words, stays."""
+        if not (self.path / VOCABULARY_FILE).exists():
+            write_vocabulary(self.path / VOCABULARY_FILE, vocabulary)
 
 
 def pair_bytes(size: tuple[int, int], vectors: int, width: int) -> int:

@@ -26,7 +26,7 @@ from vlgs.data.colmap import load_scene, open_training_views
 from vlgs.data.images import read_photograph
 from vlgs.data.source import ColmapSource
 from vlgs.data.views import ViewSource
-from vlgs.features.extractor import Extractor
+from vlgs.features.extractor import Extractor, KnowsWords
 from vlgs.features.folder import FeatureFolder, pair_bytes
 
 _NO_NUMBER_MOVES = frozenset({"weights", "device", "batch", "labels", "words"})
@@ -120,7 +120,7 @@ def run(job: Job, console: Console) -> Iterator[str]:
     todo = job.todo()
     if not todo:
         return
-    job.folder.claim(job.settings())
+    job.folder.require_same(job.settings())
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -136,9 +136,13 @@ def run(job: Job, console: Console) -> Iterator[str]:
         )
         for view in todo:
             bar.update(task, description=view.name)
-            job.folder.write(view.name, job.extractor(job.pixels(view), view.name))
+            features = job.extractor(job.pixels(view), view.name)
+            job.folder.claim(job.settings())  # not before: what cannot be read claims no folder
+            job.folder.write(view.name, features)
             bar.advance(task)
             yield view.name
+    if isinstance(job.extractor, KnowsWords):
+        job.folder.write_words(job.extractor.vocabulary)
 
 
 def estimate(job: Job) -> Iterator[str]:

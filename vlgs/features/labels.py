@@ -72,6 +72,7 @@ class LabelMasks:
             )
         rows = [known.names.index(name) for name in folder.classes]
         self.files = (labels, words)
+        self.vocabulary = known
         self.labels = folder
         self.noise = noise.resolve("hard")
         self.seed = seed

@@ -18,7 +18,7 @@ from PIL import Image
 
 from vlgs.data.export.outline import outlines
 from vlgs.data.export.sparse import write_sparse
-from vlgs.data.language import write_mask_files
+from vlgs.data.language import VOCABULARY_FILE, write_mask_files, write_vocabulary
 from vlgs.files import new_folder
 from vlgs.types import Scene, View, Vocabulary
 
@@ -131,5 +131,4 @@ def _write_language(
         vectors = np.concatenate([level.vectors for level in levels])
         write_mask_files(folder, name, np.stack(maps), vectors)
     if vocabulary is not None:
-        names, vectors = np.array(vocabulary.names), vocabulary.vectors.numpy()
-        np.savez(folder / "vocabulary.npz", names=names, embeddings=vectors)
+        write_vocabulary(folder / VOCABULARY_FILE, vocabulary)
