@@ -9,14 +9,19 @@ from statistics import fmean
 from typing import Any, cast
 
 import torch
+from hydra.utils import get_object
+from omegaconf import DictConfig
 
 from vlgs.bench.lonely import share_lonely
 from vlgs.bench.presets import composed
 from vlgs.bench.quality import score
 from vlgs.bench.record import provenance, read_record, say, show, write_record
+from vlgs.bench.shown import capture_of, psnr_shown, shown_pixels
 from vlgs.bench.unseen_draw import draw_unseen
 from vlgs.bench.unseen_row import UnseenRow
+from vlgs.data.synthetic import load_scene
 from vlgs.experiment import construct
+from vlgs.fields.splat import SplatModel
 from vlgs.fields.trained import SplatField
 from vlgs.identity import RESULTS_VERSION
 from vlgs.prepare import Prepared, make_workshop, prepare
@@ -24,6 +29,7 @@ from vlgs.report.provenance import commit
 from vlgs.runs import RunFolder
 from vlgs.training.stages import run_stages
 from vlgs.training.workshop import StoppedError
+from vlgs.types import Scene
 
 PROCEDURAL = ("glassware_ring", "mirrors_sky", "lookalikes_wall")
 """In a room, under a sky, before a plain wall."""
@@ -132,14 +138,26 @@ def _row(
     views = {name: float(view["psnr"] or 0.0) for name, view in scores.per_view.items()}
     worst = min(views, key=lambda name: views[name])
     lerf = scores.beside.get("miou_lerf_ovs")
+    unshown, shown = _of_what_is_shown(config.data, field.model, scene)
     row = UnseenRow(
         task.scene, task.split, label, seed, ready.run_id, RESULTS_VERSION, commit(), scores.psnr, views[worst], worst,
         scores.ssim, scores.miou, None if lerf is None else float(lerf), share_lonely(field.model, scene),
-        field.model.count, seconds,
+        field.model.count, seconds, unshown, fmean(shown) if shown else None, min(shown, default=None),
     )  # fmt: skip
     say(f"{task.scene}, {task.split}, {label}, seed {seed}: {row.psnr:.2f} dB, worst {row.worst:.2f}, "
         f"mIoU {row.miou}, {row.gaussians} Gaussians, {seconds:.0f} s of CPU")  # fmt: skip
     return row
+
+
+def _of_what_is_shown(
+    data: DictConfig, model: SplatModel, scene: Scene
+) -> tuple[float | None, list[float]]:
+    """Share of held-out pixels that no training photograph shows, and the PSNR of each view over the others; of procedural scenes."""
+    if get_object(data._target_) is not load_scene:
+        return None, []
+    shown = shown_pixels(capture_of(data))
+    share = 1 - float(torch.stack(list(shown.values())).float().mean())
+    return share, psnr_shown(model, scene, shown)
 
 
 def _train(ready: Prepared) -> SplatField:
@@ -186,7 +204,7 @@ class Summary:
     results_version: int
     seeds: int
     means: Mapping[str, float | None]
-    """Means over seeds, by column of `UnseenRow`; `worst` is the worst of all."""
+    """Means over seeds, by column of `UnseenRow`; `worst` and `worst_shown` are the worst of all."""
     psnr_spread: float
     """Largest minus smallest mean PSNR of the seeds, dB."""
     miou_spread: float | None
@@ -197,12 +215,14 @@ def summary(rows: Sequence[UnseenRow]) -> list[Summary]:
     groups: dict[tuple[int, str, str, str], list[UnseenRow]] = {}
     for row in rows:
         groups.setdefault((row.results_version, row.recipe, row.scene, row.split), []).append(row)
-    names = ("psnr", "ssim", "miou", "miou_lerf_ovs", "lonely", "gaussians", "cpu_seconds")
+    names = ("psnr", "ssim", "miou", "miou_lerf_ovs", "lonely", "gaussians", "cpu_seconds", "unshown", "psnr_shown")  # fmt: skip
     found = []
     for (version, recipe, scene, split), mine in groups.items():
         values = {name: [getattr(row, name) for row in mine] for name in names}
         means = {name: None if None in them else fmean(them) for name, them in values.items()}
         means["worst"] = min(row.worst for row in mine)
+        shown = [row.worst_shown for row in mine if row.worst_shown is not None]
+        means["worst_shown"] = min(shown) if len(shown) == len(mine) else None
         psnr, miou = values["psnr"], values["miou"]
         spread = None if None in miou else max(miou) - min(miou)
         found.append(
@@ -223,7 +243,8 @@ def _print(rows: Sequence[UnseenRow]) -> None:
         lines.append(
             (
                 s.scene, s.split, f"{s.recipe}, {s.results_version}", f"{s.seeds}", number(m["psnr"], 2),
-                number(spreads[0], 2), number(m["worst"], 2), number(m["ssim"], 3), number(m["miou"], 3),
+                number(spreads[0], 2), number(m["worst"], 2), number(m["psnr_shown"], 2), number(m["worst_shown"], 2),
+                number(m["ssim"], 3), number(m["miou"], 3),
                 number(spreads[1], 3), number(m["miou_lerf_ovs"], 3), number(100 * m["lonely"], 1),
                 number(m["gaussians"], 0), number(m["cpu_seconds"], 0),
             )
@@ -235,6 +256,8 @@ def _print(rows: Sequence[UnseenRow]) -> None:
         "seeds",
         "PSNR",
         "spread",
+        "worst",
+        "of what is shown",
         "worst",
         "SSIM",
         "mIoU",

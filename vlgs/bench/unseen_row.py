@@ -31,3 +31,9 @@ class UnseenRow:
     gaussians: int
     cpu_seconds: float
     """Of the training, over all threads."""
+    unshown: float | None = None
+    """Share of the held-out pixels whose surface no training photograph shows (`shown_pixels`); None of photographs of real scenes."""
+    psnr_shown: float | None = None
+    """As `psnr`, over the other pixels."""
+    worst_shown: float | None = None
+    """As `worst`, over the other pixels."""
