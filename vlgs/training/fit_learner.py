@@ -29,7 +29,7 @@ def train_learner(
     """
     folder = workshop.folder.part(name)
     if name:
-        log.info("model %s of this run, in %s", name, folder.path)
+        log.info("model %s, a part of this run", name)
     stopped_by = train_on(learner, learner.restore, (), folder, workshop.make_options())
     require_done(learner, stopped_by, name)
     learner.model.requires_grad_(False)

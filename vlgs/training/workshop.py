@@ -116,7 +116,7 @@ class Workshop:
         """
         folder = self.folder.part(name)
         if name:
-            log.info("model %s of this run, in %s", name, folder.path)
+            log.info("model %s, a part of this run", name)
         module = self._build(scene, change(self.make_parts()), start, color, codes)
         stopped_by = fit(module, folder, self._options(module, color or start is not None))
         require_done(module, stopped_by, name)
