@@ -79,6 +79,8 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
     "gaussians.near_share": 0,
+    "gaussians.densify.share_weights": False,
+    "gaussians.densify.by_error": False,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),
     "query.masks": None,

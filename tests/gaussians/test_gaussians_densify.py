@@ -106,6 +106,52 @@ def test_clones_copy_their_row_and_moments_stay_with_their_gaussians(options: di
     assert all(value.isfinite().all() for value in params.values())
 
 
+@given(weight=st.floats(0.0101, 0.999), other=st.floats(0.0101, 0.999))
+@settings(max_examples=40, deadline=None)
+def test_a_clone_and_its_original_cover_what_the_original_did(weight: float, other: float):
+    config = GaussiansConfig(densify=DensifyConfig(share_weights=True))
+    params = make(20, opacity=weight, indicator=other)
+    assert run(params, state_of([COLD] * 18 + [HOT, COLD]), config).cloned == 1
+    for name, before in (("opacity_logits", weight), ("indicator_logits", other)):
+        through = 1 - params[name].detach().double().sigmoid()
+        assert (through[18] * through[20]).item() == pytest.approx(1 - before, rel=1e-4)
+        assert torch.equal(through[18], through[20])
+        torch.testing.assert_close(through[:18], torch.full((18,), 1 - before).double())
+
+
+def test_weights_are_shared_by_levels_and_never_so_that_both_go():
+    config = GaussiansConfig(densify=DensifyConfig(share_weights=True))
+    params = make(20, opacity=0.008, indicator=0.5)
+    params["indicator_logits"] = nn.Parameter(torch.tensor([[0.0, 3.0, 40.0]]).repeat(20, 1))
+    run(params, state_of([HOT] + [COLD] * 19), config)
+    torch.testing.assert_close(params["opacity_logits"][0].sigmoid().item(), 0.008)
+    kept = 1 - params["indicator_logits"].detach().double().sigmoid()
+    want = (1 - torch.tensor([0.0, 3.0, 40.0]).double().sigmoid()).sqrt()
+    torch.testing.assert_close(kept[20], want, atol=1e-6, rtol=1e-6)
+    split = make(20, scale=MIDDLE)
+    run(split, state_of([HOT] + [COLD] * 19), config)
+    torch.testing.assert_close(split["opacity_logits"][-2:].sigmoid(), torch.full((2,), 0.5))
+
+
+def test_errors_choose_among_gradients_and_gradients_say_how_many():
+    grads, error = [HOT, HOT, HOT / 2, COLD] + [COLD] * 16, torch.full((20,), 1e-3)
+    error[:4] = torch.tensor([0.0, 1.0, 9.0, 100.0])
+    params = make(20)
+    report = densify(
+        params, adam(params), state_of(grads), GaussiansConfig(), EXTENT, 0, EARLY, error=error
+    )
+    assert report.cloned == 3  # as many as reach the threshold of 2e-4
+    # HOT * 1, HOT / 2 * 3, COLD * 10: the first, whose pixels are right, stays alone.
+    assert torch.equal(params["means"][20:], params["means"][[1, 2, 3]])
+    none = make(20)
+    zeros = torch.zeros(20)
+    state = state_of(grads)
+    assert (
+        densify(none, adam(none), state, GaussiansConfig(), EXTENT, 0, EARLY, error=zeros).count
+        == 20
+    )
+
+
 def test_pruned_rows_take_their_moments_with_them():
     params = make(20)
     optimizer = adam(params)

@@ -17,6 +17,7 @@ from vlgs.training.build import Parts, build_module
 from vlgs.training.checkpoint import load_checkpoint
 from vlgs.training.fit import FitOptions, fit
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.pixel_error import pixel_error
 from vlgs.types import Scene, View
 
 SCHEDULE = (
@@ -93,6 +94,39 @@ def test_resume_is_bit_identical_to_never_having_stopped(
     assert_same_bits(whole, second)
 
 
+CHOSEN = ("gaussians.densify.share_weights=true", "gaussians.densify.by_error=true")
+
+
+@pytest.mark.parametrize("stop", [3, 9])  # 3: small views; 9: whole ones
+@pytest.mark.usefixtures("unchecked")
+def test_densification_by_error_resumes_to_the_bit(tiny_scene: Scene, tmp_path: Path, stop: int):
+    options = (*CHOSEN, "trainer.half_size=0.3", "trainer.iterations=15")
+    whole = train(module_of(tiny_scene, *options), tmp_path / "whole")
+    first = module_of(tiny_scene, *options)
+    stop_at(first, stop)
+    train(first, tmp_path / "parts")
+    assert_same_bits(whole, train(module_of(tiny_scene, *options), tmp_path / "parts"))
+    other = train(module_of(tiny_scene, *options[2:]), tmp_path / "other")
+    assert not torch.equal(whole.model.splats["means"], other.model.splats["means"])
+
+
+def test_errors_are_summed_with_the_weights_that_blend_them(tiny_scene: Scene):
+    module = module_of(tiny_scene, "gaussians.init_opacity=0.6")
+    model, cameras = module.model, module.views.scene.train
+    with torch.no_grad():
+        fused, want = model.fuse(), torch.zeros(model.count)
+        for index in range(len(cameras)):  # fewer than are drawn
+            error = module.step.color_error(index, 0, fused)
+            own = (model.render(cameras[index].camera).color - module.views[index].image).abs()
+            torch.testing.assert_close(error, own.mean(-1))
+            one, scores = torch.eye(model.count)[:4], fused.gaussians.opacities
+            for row in range(4):  # the image of a Gaussian that alone is white is its weight
+                image = model.render_values(cameras[index].camera, one[row][:, None], scores)
+                want[row] += (image[..., 0] * error).sum()
+    torch.testing.assert_close(pixel_error(module, 0)[:4], want[:4], rtol=1e-4, atol=1e-5)
+    assert want[:4].max() > 0
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
     tiny_scene: Scene, tmp_path: Path
@@ -102,7 +136,7 @@ def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
         modules = []
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            modules.append(train(module_of(tiny_scene), tmp_path / str(count)))
+            modules.append(train(module_of(tiny_scene, *CHOSEN), tmp_path / str(count)))
     finally:
         torch.set_num_threads(threads)
     assert_same_bits(modules[0], modules[1])
@@ -294,6 +328,9 @@ def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
         ["gaussians.color=evaluated", "blend.pairs=neighbours", "trainer.means_steps=30000"],
         ["gaussians.init_features=lifted", "blend.kept=nearer", "blend.rotation=false"],
         ["sharing=pos", "gaussians.densify.reset_indicator=true", "indicator=opacity"],
+        ["sharing=none", "gaussians.densify={share_weights: true, by_error: true}"],
+        ["gaussians.color=evaluated", "trainer.exposure=true", *CHOSEN],
+        ["gaussians.densify_on=rgb", "gaussians.background=0", *CHOSEN],
     ],
     ids=" ".join,
 )

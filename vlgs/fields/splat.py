@@ -189,6 +189,7 @@ class SplatModel(nn.Module):
         values: Float[Tensor, "n c"],
         weight: Float[Tensor, " n"],
         step: int = 1,
+        of_color: bool = False,
     ) -> Float[Tensor, "h w c"]:
         """Blend any per-Gaussian values with any weight, in the shapes of language, e.g. the l - o map of Fig. 3.
 
@@ -198,9 +199,11 @@ class SplatModel(nn.Module):
             weight: In place of the opacity, in [0, 1].
             step: Of `camera`, where it is every `step`-th pixel of another (`vlgs.geometry.subsample_camera`). They come out as in the other's
                 image, but for Gaussians that `RasterConfig.fov_margin` clamps, as that depends on the image.
+            of_color: In the shapes of colour instead.
         """
         gaussians = self.gaussians()
-        group = ChannelGroup(values, weight, shape=gaussians.language_shape)
+        shape = None if of_color else gaussians.language_shape
+        group = ChannelGroup(values, weight, shape=shape)
         return self._rasterize(gaussians, [group], camera, step).images[0]
 
     def raster_of(self, step: int) -> RasterConfig:

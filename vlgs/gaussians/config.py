@@ -40,6 +40,12 @@ class DensifyConfig:
     """A reset lowers every opacity to this at most."""
     reset_indicator: bool = False
     """Whether a reset lowers the indicators as well."""
+    share_weights: bool = False
+    """Whether a clone and its original together cover what the original did (Rota Bulo et al. 2024, "Revising Densification"): opacity and
+    indicator w become 1 - sqrt(1 - w) in both. False is 3DGS's: both keep w, and what lies behind them loses light."""
+    by_error: bool = False
+    """Whether those that are cloned or split are chosen by the errors of the pixels that they blend, too (`vlgs.training.pixel_error`): as many
+    as reach `grad_threshold`, those of the highest mean gradient times the root of that error."""
 
     def __post_init__(self) -> None:
         _require_at_least("densify", 1, every=self.every)

@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -111,6 +112,7 @@ def densify(
     step: int,
     centers: Float[Tensor, "v 3"] | None = None,
     attributes: Attributes = STANDARD,
+    error: Float[Tensor, " n"] | None = None,
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
@@ -128,6 +130,8 @@ def densify(
         step: Of the run; large Gaussians are spared until the first opacity reset has passed.
         centers: Of the training cameras; what is behind them may be large, and larger the farther it is. None: nothing may.
         attributes: The table of `params`.
+        error: Of the pixels that a Gaussian blends, from 0 on, in any unit. As many as reach the threshold are cloned or split, those of the highest
+            mean gradient times the root of it. None: those that reach the threshold.
 
     Raises:
         ValueError: If `state` has another size than `params`, or no Gaussian is finite.
@@ -137,11 +141,16 @@ def densify(
         raise ValueError(f"densify: state must have {n} rows, got {state.grad_sum.shape[0]}")
     with torch.no_grad():
         dead = _dead(params, config, attributes)
-        hot = _hot(state, config) & ~dead
-        grow = _highest(hot, state.mean(), config.max_count - int((~dead).sum()))
+        hot, merit = _hot(state, config) & ~dead, state.mean()
+        if error is not None:
+            merit = merit * error.sqrt()
+            hot = _highest(~dead & (merit > 0), merit, int(hot.sum()))
+        grow = _highest(hot, merit, config.max_count - int((~dead).sum()))
         small = _largest_scale(params, attributes) <= config.densify.dense_share * extent
         rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
         values = {name: value[rows.source] for name, value in params.items()}
+        if config.densify.share_weights:
+            _share_weights(values, (grow & small)[rows.source], config.densify.prune_below)
         _place_children(values, rows, seeded_generator("densify", seed, step), attributes)
         kept = _not_large(values, config, extent, step, centers, attributes)
         if not kept.all():
@@ -264,6 +273,19 @@ def _place_children(
     values["means"][rows.child] += (rotation @ offsets[..., None]).squeeze(-1)
     for scales in _having(values, attributes, "scale"):
         scales[rows.child] -= math.log(SHRINK)
+
+
+def _share_weights(
+    values: dict[str, Tensor], paired: Bool[Tensor, " m"], prune_below: float
+) -> None:
+    """Clones and their originals let through together what the original did, in place; a share that would be pruned is not made."""
+    for name in ("opacity_logits", "indicator_logits"):
+        logits = values[name]
+        # By numpy, as the bits of torch's logarithms depend on the number of threads; through: what one of the two lets, its logarithm.
+        through = -np.logaddexp(0.0, logits.double().numpy()) / 2
+        shared = torch.from_numpy(np.log(-np.expm1(through)) - through).to(logits.dtype)
+        at = paired if logits.dim() == 1 else paired[:, None]
+        values[name] = torch.where(at & (shared > logit(prune_below)), shared, logits)
 
 
 def _having(params: Parameters, attributes: Attributes, role: Role) -> list[Tensor]:

@@ -23,6 +23,7 @@ from vlgs.training.checkpoint import save_checkpoint
 from vlgs.training.curves import COLUMNS, csv_lines, read_rows
 from vlgs.training.learner import Learner
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.pixel_error import pixel_error
 from vlgs.training.silence import silence
 from vlgs.training.state import capture
 
@@ -50,6 +51,7 @@ class Densification(AfterStep):
         if done == module.settings.iterations:
             return  # no iteration would train what comes, or bring back what is made transparent
         if config.densify.densifies_at(done):
+            judged = config.densify.by_error and "color" in module.step.needs
             did = densify(
                 module.model.splats,
                 module.optimizer,
@@ -60,6 +62,7 @@ class Densification(AfterStep):
                 done,
                 densifying.centers,
                 module.model.attributes,
+                pixel_error(module, report.step) if judged else None,
             )
             if did.refused and not self.full:
                 self.full = True

@@ -14,7 +14,7 @@ from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.losses import masked_mse
 from vlgs.objectives import Setup, StepView
 from vlgs.objectives.objective import all_needs
-from vlgs.objectives.targets import Target, TrainingViews
+from vlgs.objectives.targets import Target, TrainingViews, covered
 from vlgs.training.cached_renders import CachedRenders, has_frozen_shape
 from vlgs.training.exposure import Exposure
 from vlgs.training.settings import TrainerConfig
@@ -152,6 +152,16 @@ class TrainingStep:
         if render.mean2d.requires_grad:
             render.mean2d.retain_grad()
         return render
+
+    @torch.no_grad()
+    def color_error(self, index: int, step: int, fused: FusedGaussians) -> Float[Tensor, "h w"]:
+        """Mean absolute error of a training view's colours, in the size that an iteration sees; 0 where its photograph shows nothing."""
+        target = self.views(step)[index]
+        render = self._exposed(index, self.model.render(target.view.camera, True, False, fused))
+        assert render.color is not None
+        error = (render.color - target.image).abs().mean(dim=-1)
+        seen = covered(target.view)
+        return error if seen is None else error * seen
 
     def trained(self) -> Iterator[tuple[str, nn.Parameter]]:
         """What an iteration can move, by name: not a head that was fitted before."""
