@@ -117,7 +117,9 @@ def test_errors_are_summed_with_the_weights_that_blend_them(tiny_scene: Scene):
         fused, want = model.fuse(), torch.zeros(model.count)
         for index in range(len(cameras)):  # fewer than are drawn
             error = module.step.color_error(index, 0, fused)
-            own = (model.render(cameras[index].camera).color - module.views[index].image).abs()
+            color = model.render(cameras[index].camera).color
+            assert color is not None
+            own = (color - module.views[index].image).abs()
             torch.testing.assert_close(error, own.mean(-1))
             one, scores = torch.eye(model.count)[:4], fused.gaussians.opacities
             for row in range(4):  # the image of a Gaussian that alone is white is its weight
