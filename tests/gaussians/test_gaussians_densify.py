@@ -134,22 +134,16 @@ def test_weights_are_shared_by_levels_and_never_so_that_both_go():
 
 
 def test_errors_choose_among_gradients_and_gradients_say_how_many():
-    grads, error = [HOT, HOT, HOT / 2, COLD] + [COLD] * 16, torch.full((20,), 1e-3)
-    error[:4] = torch.tensor([0.0, 1.0, 9.0, 100.0])
-    params = make(20)
-    report = densify(
-        params, adam(params), state_of(grads), GaussiansConfig(), EXTENT, 0, EARLY, error=error
-    )
-    assert report.cloned == 3  # as many as reach the threshold of 2e-4
-    # HOT * 1, HOT / 2 * 3, COLD * 10: the first, whose pixels are right, stays alone.
-    assert torch.equal(params["means"][20:], params["means"][[1, 2, 3]])
-    none = make(20)
-    zeros = torch.zeros(20)
-    state = state_of(grads)
-    assert (
-        densify(none, adam(none), state, GaussiansConfig(), EXTENT, 0, EARLY, error=zeros).count
-        == 20
-    )
+    grads, error = [HOT, HOT, HOT / 2, COLD, 10 * COLD] + [COLD] * 15, torch.full((20,), 1e-3)
+    error[:5] = torch.tensor([1.0, 0.0, 9.0, 100.0, 4.0])
+    params, config = make(20), GaussiansConfig()
+    # Three reach the threshold of 2e-4, and one of them draws nothing wrong; gradient times root: 1e-3, 0, 1.5e-3, 1e-4, 2e-4.
+    report = densify(params, adam(params), state_of(grads), config, EXTENT, 0, EARLY, error=error)
+    assert report.cloned == 3
+    assert torch.equal(params["means"][20:], params["means"][[0, 2, 4]])
+    right, zeros = make(20), torch.zeros(20)
+    densify(right, adam(right), state_of(grads), config, EXTENT, 0, EARLY, error=zeros)
+    assert len(right["means"]) == 20
 
 
 def test_pruned_rows_take_their_moments_with_them():
