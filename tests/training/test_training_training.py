@@ -129,6 +129,14 @@ def test_errors_are_summed_with_the_weights_that_blend_them(tiny_scene: Scene):
     assert want[:4].max() > 0
 
 
+def test_errors_are_summed_in_the_shapes_of_colour(tiny_scene: Scene):
+    module = module_of(tiny_scene, "sharing=pos")
+    before = pixel_error(module, 0)
+    with torch.no_grad():
+        module.model.splats["language_log_scales"] += 1
+    assert torch.equal(pixel_error(module, 0), before)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
     tiny_scene: Scene, tmp_path: Path
@@ -330,7 +338,7 @@ def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
         ["gaussians.color=evaluated", "blend.pairs=neighbours", "trainer.means_steps=30000"],
         ["gaussians.init_features=lifted", "blend.kept=nearer", "blend.rotation=false"],
         ["sharing=pos", "gaussians.densify.reset_indicator=true", "indicator=opacity"],
-        ["sharing=none", "gaussians.densify={share_weights: true, by_error: true}"],
+        ["sharing=pos", "indicator=opacity", *CHOSEN],
         ["gaussians.color=evaluated", "trainer.exposure=true", *CHOSEN],
         ["gaussians.densify_on=rgb", "gaussians.background=0", *CHOSEN],
     ],

@@ -4,7 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vlgs.fields.splat import SplatModel
 from vlgs.training.lightning import VLGSModule
+from vlgs.types import Camera
 
 
 def lift_features(module: VLGSModule) -> None:
@@ -18,14 +20,16 @@ def lift_features(module: VLGSModule) -> None:
         weight = module.model.fuse().language_weight
     weights = [weight] * levels if weight.dim() == 1 else [w.contiguous() for w in weight.unbind(1)]
     total = features.new_zeros(levels, len(features), features.shape[1] // levels + 1)
-    for index in range(len(module.views.scene.train)):
+    for index, view in enumerate(module.views.scene.train):
         target = module.views[index]
         if not target.has_language:
             continue
         seen = target.valid[..., None].to(features)
         image = torch.cat([target.codes * seen, seen], dim=-1)
         for level, own in enumerate(weights):
-            total[level] += gathered(module, index, own, image[:, level::levels].contiguous())
+            total[level] += gathered(
+                module.model, view.camera, own, image[:, level::levels].contiguous()
+            )
     with torch.no_grad():
         codes = features.unflatten(1, (levels, -1)).transpose(0, 1)
         lifted = total[..., :-1] / total[..., -1:].clamp_min(torch.finfo(total.dtype).tiny)
@@ -34,11 +38,22 @@ def lift_features(module: VLGSModule) -> None:
 
 
 def gathered(
-    module: VLGSModule, index: int, weight: Float[Tensor, " n"], image: Float[Tensor, "h w c"]
+    model: SplatModel,
+    camera: Camera,
+    weight: Float[Tensor, " n"],
+    image: Float[Tensor, "h w c"],
+    of_color: bool = False,
 ) -> Float[Tensor, "n c"]:
-    """Per Gaussian the sum over pixels of its blending weight times the image."""
+    """Per Gaussian the sum over pixels of its blending weight times the image.
+
+    Args:
+        model: Whose Gaussians.
+        camera: Of the image.
+        weight: What blends, in [0, 1].
+        image: What is summed.
+        of_color: In the shapes of colour, not of language.
+    """
     values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
-    camera = module.views.scene.train[index].camera
     with torch.enable_grad():
-        rendered = module.model.render_values(camera, values, weight)
+        rendered = model.render_values(camera, values, weight, of_color=of_color)
         return torch.autograd.grad(rendered, values, image)[0]

@@ -48,7 +48,7 @@ def outside_masks(module: VLGSModule) -> Float[Tensor, "n levels"]:
             continue
         for level, own in enumerate(levels):
             image = _outside_and_all(target.valid[:, level :: len(levels)], seen)
-            total[:, level] += gathered(module, index, own, image)
+            total[:, level] += gathered(model, views[index].camera, own, image)
     outside, everywhere = total.unbind(-1)
     return outside / everywhere.clamp_min(torch.finfo(total.dtype).tiny)
 
