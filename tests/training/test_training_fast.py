@@ -155,3 +155,14 @@ def test_rates_made_for_another_budget_grow_by_the_root(tiny_scene: Scene):
 def test_what_cannot_be_is_refused_by_name(key: str, value: float):
     with pytest.raises(ValueError, match=f"trainer: {key} must be"):
         TrainerConfig(10, LearningRates(), **{key: value})  # type: ignore[arg-type]
+
+
+def test_best_takes_large_steps_in_a_short_budget_and_lets_its_positions_rest_as_far():
+    given = TrainerConfig(1, LearningRates()).learning_rates
+    ends = {
+        trainer: composed("method=best", f"trainer={trainer}").trainer.learning_rates
+        for trainer in ("default", "fast", "fast_photos")
+    }
+    assert {rates.means for rates in ends.values()} == {given.means}
+    assert ends["default"].means_final == given.means_final
+    assert ends["fast"].means_final == ends["fast_photos"].means_final == given.means / 10

@@ -49,13 +49,21 @@ def _skips(on: bool) -> tuple[str, ...]:
     return turn((s.name for s in SKIPS if s.switchable and s.name not in left), on)
 
 
+_RATE = "trainer.learning_rates."
 LEVERS: dict[str, tuple[str, ...]] = {
-    "paper's rates": tuple(
-        f"trainer.learning_rates.{name}={rate:g}" for name, rate in asdict(LearningRates()).items()
+    "paper's rates": (
+        "trainer.rates_for=null",
+        *(f"{_RATE}{name}={rate:g}" for name, rate in asdict(LearningRates()).items()),
     ),
+    "paper's rates of language": (f"{_RATE}features=5e-3", f"{_RATE}indicator_logits=5e-2"),
     "rates that stay": ("trainer.color_decay=1",),
+    "positions that come to rest": (f"{_RATE}means_final=1.6e-6",),
     "whole views": ("trainer.half_size=0",),
-    "harmonics a twentieth": ("trainer.learning_rates.shN=1.5e-3",),
+    "harmonics a twentieth": (f"{_RATE}shN=2.5e-4",),
+    "3DGS's densification": (
+        "gaussians.densify.share_weights=false",
+        "gaussians.densify.by_error=false",
+    ),
 }
 """What ``trainer=fast`` is without one of its parts."""
 
