@@ -51,13 +51,14 @@ def test_photographs_are_told_where_their_language_is():
 
 
 def test_a_curve_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    scenes = {"synthetic": (*train.QUICK, "trainer.iterations=6")}
+    scenes = {"synthetic": (*train.QUICK, "trainer.iterations=6", f"results={tmp_path}")}
     rows = train.run_train(scenes, ["neither"], tmp_path, 2, 1, [0])
     assert rows[0].iterations == 6
     assert rows[0].seconds > 0
     assert rows[0].psnr is not None
     files = list((tmp_path / "train").glob("*.csv"))
     assert len(files) == 1
+    assert str(tmp_path) not in files[0].read_text()
     table = read_record(files[0])
     assert list(table.iteration) == [2, 6]
     assert table.seconds.is_monotonic_increasing

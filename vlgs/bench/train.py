@@ -26,6 +26,7 @@ from vlgs.bench.record import (
 )
 from vlgs.experiment import construct
 from vlgs.identity import RESULTS_VERSION
+from vlgs.places import without_places
 from vlgs.runs import RunFolder
 from vlgs.skips import SKIPS, turn
 from vlgs.training.checkpoint import load_checkpoint
@@ -235,7 +236,8 @@ def _curve(
         say(f"{name}, {label}: {path} is there")
         return read_record(path).assign(label=label)
     say(f"{name}, {label}: {iterations} iterations ...")
-    header = provenance(seed, overrides=" ".join(overrides), training_threads=threads)
+    told = " ".join(without_places([*overrides]))
+    header = provenance(seed, overrides=told, training_threads=threads)
     trained = Trained(experiment, scene, build(experiment, scene))
     curve = Curve(trained, name, label, evaluated_at(iterations, points))
     with RunFolder(path.with_suffix("")).writing() as folder:
