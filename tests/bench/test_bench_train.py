@@ -1,5 +1,6 @@
 """Learning curves: written once, evaluation left out of the time."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from omegaconf import OmegaConf
 from vlgs.bench import curve, train
 from vlgs.bench.curve import evaluated_at, seconds_to
 from vlgs.bench.presets import composed
-from vlgs.bench.record import read_record
+from vlgs.bench.record import STYLE, plain_ticks, read_record
 from vlgs.identity import RESULTS_VERSION
 from vlgs.skips import SKIPS
 from vlgs.training.after_step import TrainedModule
@@ -144,3 +145,29 @@ def test_a_training_that_was_stopped_goes_on_with_its_clocks_and_points(
     assert table.seconds.is_monotonic_increasing
     whole = train.run_train(scenes, ["neither"], tmp_path / "whole", 3, 1, [0])
     assert (rows[0].psnr, rows[0].miou) == (whole[0].psnr, whole[0].miou)
+
+
+@pytest.mark.parametrize("ends", [(5, 90), (30, 8000), (5, 10_000)])
+def test_labels_of_the_seconds_do_not_run_into_each_other(ends: tuple[float, float]):
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 2.9), layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        panel, _ = figure.subplots(1, 2)
+        panel.plot(ends, (1.0, 2.0))
+        panel.set_xscale("log")
+        plain_ticks(panel.xaxis)
+        canvas.draw()
+        labels = [label for label in panel.get_xticklabels() if label.get_text()]
+        boxes = [label.get_window_extent() for label in labels]
+    low, high = panel.get_xlim()
+    drawn = [
+        box
+        for label, box in zip(labels, boxes, strict=True)
+        if low <= label.get_position()[0] <= high
+    ]
+    assert len(drawn) >= 2
+    assert all(left.x1 < right.x0 for left, right in pairwise(drawn))

@@ -41,6 +41,8 @@ STYLE: "dict[RcKeyType, Any]" = {
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#555555", "#000000")
 """Told apart by every kind of colour vision (Okabe and Ito)."""
 DPI = 200
+FEW_DECADES = 300.0
+"""Up to this ratio of its ends an axis has room for three labels a decade."""
 
 
 def provenance(seed: int | None, program: str = "vlgs.bench", **notes: object) -> dict[str, object]:
@@ -110,10 +112,14 @@ def read_record(path: Path) -> pd.DataFrame:
 
 
 def plain_ticks(axis: "Axis") -> None:
-    """Label a logarithmic axis at 1, 2 and 5 of every decade, as plain numbers."""
+    """Label a logarithmic axis at 1, 2 and 5 of every decade, as plain numbers; at 1 and 3 where there are many decades.
+
+    To be called after plotting: it goes by what is drawn.
+    """
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    low, high = axis.get_data_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 3) if high > FEW_DECADES * low else (1, 2, 5)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
