@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,26 @@ def test_detached_opacity_gets_no_gradient(gaussians: Gaussians):
     weight = Opacity(detach=True)(gaussians)
     assert torch.equal(weight, gaussians.opacities)
     assert not weight.requires_grad
+
+
+def test_copies_block_as_so_many_gaussians_in_one_place(gaussians: Gaussians):
+    through = (1 - gaussians.opacities).double()
+    want = 1 - through * through * through
+    assert torch.allclose(Opacity(copies=3.0)(gaussians).double(), want, atol=1e-6)
+
+
+def test_copies_of_what_is_solid_have_a_finite_gradient(gaussians: Gaussians):
+    opacities = torch.tensor([0.0, 0.3, 1.0, 1.0], requires_grad=True)
+    Opacity(copies=1.5)(replace(gaussians, opacities=opacities)).sum().backward()
+    assert opacities.grad is not None
+    slope = 1.5 * (1 - opacities.detach()) ** 0.5
+    assert torch.allclose(opacities.grad, slope)
+
+
+@pytest.mark.parametrize("copies", [0.99, 1001.0, float("nan")])
+def test_fewer_copies_than_one_are_refused(copies: float):
+    with pytest.raises(ValueError, match="opacity: copies must be 1 to 1000, got"):
+        Opacity(copies=copies)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])

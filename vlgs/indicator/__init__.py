@@ -10,6 +10,7 @@ from torch import Tensor
 
 from vlgs.demands import Demand
 from vlgs.types import Gaussians
+from vlgs.values import require_range
 
 
 @runtime_checkable
@@ -50,16 +51,26 @@ class PerLevel:
 
 @dataclass(frozen=True)
 class Opacity:
-    """Language blended with the colour opacity, as earlier systems do (Eq. 2)."""
+    """Language blended with the colour opacity, as earlier systems do (Eq. 2).
+
+    Raises:
+        ValueError: If `copies` is outside [1, 1000].
+    """
 
     untrained: ClassVar[bool] = True
     """It learns nothing beside colour."""
     detach: bool = False
     """Whether the language loss is kept from moving the opacity; the paper lets it (conf/README.md, D.15)."""
+    copies: float = 1.0
+    """How often a Gaussian stands in its place for language: ``1 - (1 - opacity)^copies``. Above 1 what lies behind glass says less of the glass."""
+
+    def __post_init__(self) -> None:
+        require_range("opacity", 1, 1000, copies=self.copies)
 
     def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
-        """Return `gaussians.opacities` itself, so that the rasteriser runs one transmittance chain for both modalities."""
-        return gaussians.opacities.detach() if self.detach else gaussians.opacities
+        """Return `gaussians.opacities` itself, so that the rasteriser runs one transmittance chain for both modalities, or of more copies a new tensor."""
+        opacities = gaussians.opacities.detach() if self.detach else gaussians.opacities
+        return opacities if self.copies == 1 else 1 - (1 - opacities) ** self.copies
 
 
 @dataclass(frozen=True)
