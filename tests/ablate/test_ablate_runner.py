@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import signal
 import sys
 import threading
@@ -80,6 +81,24 @@ def test_what_is_missing_is_run_once_and_the_tables_are_written(
     assert ablate(request_of(table, results, seeds=(0, 1))) == 0  # extends
     assert len(ran(results)) == 4
     assert Benchmark.read(folder / "benchmark.yaml").seeds == (0, 1)
+
+
+def test_rows_of_runs_csv_are_not_run_again_where_their_folders_are_gone(
+    table: Table, tmp_path: Path
+):
+    results = tmp_path / "r"
+    assert ablate(request_of(table, results)) == 0
+    written = (results / "synthetic" / "tiny.csv").read_text()
+    shutil.rmtree(results / "runs")  # as in a clone
+    assert ablate(request_of(table, results)) == 0
+    assert len(ran(results)) == 2
+    assert (results / "synthetic" / "tiny.csv").read_text() == written
+    assert ablate(request_of(table, results, seeds=(0, 1))) == 0
+    assert sorted(ran(results)[2:]) == ["none glassware 1", "self glassware 1"]
+    (results / "runs.csv").unlink()
+    shutil.rmtree(results / "runs")
+    assert ablate(request_of(table, results)) == 0
+    assert len(ran(results)) == 6
 
 
 def test_a_failure_is_shown_with_its_log_and_the_others_go_on(

@@ -8,9 +8,9 @@
 Keys: `tab`; `scenes` (default: all of the data set); `seeds` (a count, or a list such as 0,4,7; default 3); `name` (folder of
 the tables below results, default the data set); `results`; `dry=true` only says what would run; `warm=false` starts every run
 on this machine from nothing, where otherwise a parent does the imports once. Everything else goes to each run, or to Hydra's
-launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made it.
-Ctrl-C lets the runs save; the same command goes on. Exit status: 0 all tables are filled, 1 a run failed (its last lines and
-its log are shown), 130 stopped by Ctrl-C.
+launcher (`hydra...`; see conf/hydra/launcher/README.md). A run that exists is not run again, whoever made it: one that has a folder, or a
+row of runs.csv as in a clone. Ctrl-C lets the runs save; the same command goes on. Exit status: 0 all tables are filled, 1 a run failed
+(its last lines and its log are shown), 130 stopped by Ctrl-C.
 """
 
 import os
@@ -34,12 +34,13 @@ from rich.markup import escape
 
 from vlgs.ablate.job import STOP, JobOutcome
 from vlgs.ablate.launch import launch
-from vlgs.ablate.plan import PlannedRun, find, plan
+from vlgs.ablate.plan import PlannedRun, RunKey, find, plan
 from vlgs.ablate.progress import Count, duration, shown
 from vlgs.config import literal_override, override_value
+from vlgs.identity import RunIdentity
 from vlgs.runs import STOPPED, stop_signals
 from vlgs.tables.benchmark import Benchmark, Composer, is_scene_file
-from vlgs.tables.frame import read_metrics
+from vlgs.tables.frame import read_lines, read_metrics
 from vlgs.tables.registry import Table, choose, load_tables
 from vlgs.tables.write import write_all
 from vlgs.text import screen, visible
@@ -175,8 +176,9 @@ def ablate(request: Request) -> int:
     results, benchmark = request.results, request.benchmark
     composer = Composer(benchmark, results / benchmark.name / "recipes.json")
     planned = plan(request.tables, benchmark, composer)
+    recorded = _recorded(results)
     if request.dry:
-        missing, _ = _missing(planned, results, {})
+        missing, _ = _missing(planned, results, recorded, {})
         console.print(f"{len(planned)} runs, {len(missing)} to do")
         for run in missing:
             command = shlex.join(["python", "-m", "vlgs.run", *run.overrides])
@@ -188,7 +190,7 @@ def ablate(request: Request) -> int:
     folder = results / "logs" / f"{datetime.now():%Y%m%d-%H%M%S.%f}-{os.getpid()}"
     tally = Tally()
     with stop_file(folder / STOP) as stopping:
-        _run_missing(request, planned, folder, tally, stopping, console)
+        _run_missing(request, planned, recorded, folder, tally, stopping, console)
     for name, reason in tally.failed.items():
         text = screen(reason).replace("\n", "\n    ")
         console.print(f"[red]failed: {escape(visible(name))}[/red]\n    {escape(text)}")
@@ -205,6 +207,7 @@ def ablate(request: Request) -> int:
 def _run_missing(
     request: Request,
     planned: Sequence[PlannedRun],
+    recorded: Mapping[RunKey, Mapping[str, Any]],
     folder: Path,
     tally: Tally,
     stopping: threading.Event,
@@ -212,7 +215,7 @@ def _run_missing(
 ) -> None:
     first, expected = 0, set[str]()
     while not stopping.is_set():
-        missing, seconds = _missing(planned, request.results, tally.failed)
+        missing, seconds = _missing(planned, request.results, recorded, tally.failed)
         for run in missing:
             if run.name in expected:  # else this would go on for ever
                 tally.failed[run.name] = "it ended well, but its results are not those of this row"
@@ -246,11 +249,29 @@ def _run_missing(
             stopping.wait(WAIT_SECONDS)
 
 
+def _recorded(results: Path) -> dict[RunKey, Mapping[str, Any]]:
+    """Training times of the runs that stand in runs.csv, which tables are made of whether their folders are here or not.
+
+    Raises:
+        ValueError: If the file is not as it was written.
+    """
+    found: dict[RunKey, dict[str, Any]] = {}
+    for line in read_lines(results):
+        key = RunIdentity(line.recipe, line.data_recipe, line.seed), line.scene
+        run = found.setdefault(key, {})
+        if line.metric == "train_seconds":
+            run[line.metric] = line.value
+    return found
+
+
 def _missing(
-    planned: Sequence[PlannedRun], results: Path, failed: Mapping[str, str]
+    planned: Sequence[PlannedRun],
+    results: Path,
+    recorded: Mapping[RunKey, Mapping[str, Any]],
+    failed: Mapping[str, str],
 ) -> tuple[list[PlannedRun], float | None]:
     """Runs without results that are still to be tried, and the median training time of the others."""
-    done = find(read_metrics(results))
+    done = {**recorded, **find(read_metrics(results))}
     missing = [run for run in planned if run.key not in done and run.name not in failed]
     times = sorted(
         done[run.key]["train_seconds"]

@@ -9,6 +9,9 @@ from vlgs.identity import RunIdentity
 from vlgs.tables.benchmark import Benchmark, Composer
 from vlgs.tables.registry import Table
 
+RunKey = tuple[RunIdentity, str]
+"""What makes two runs one: the identity, and the scene."""
+
 
 @dataclass(frozen=True)
 class PlannedRun:
@@ -22,7 +25,7 @@ class PlannedRun:
     """Rows that it fills, as ``table: row``."""
 
     @property
-    def key(self) -> tuple[RunIdentity, str]:
+    def key(self) -> RunKey:
         """What makes two runs one."""
         return self.identity, self.scene
 
@@ -42,7 +45,7 @@ def plan(
     """
     composer = composer or Composer(benchmark)
     by_scene = composer.takes_scenes()
-    wanted: dict[tuple[RunIdentity, str], tuple[tuple[str, ...], list[str]]] = {}
+    wanted: dict[RunKey, tuple[tuple[str, ...], list[str]]] = {}
     for seed in benchmark.seeds:
         for table in tables:
             if seed not in table.chosen(benchmark.seeds):
@@ -66,7 +69,7 @@ def plan(
     ]
 
 
-def find(runs: Sequence[Mapping[str, Any]]) -> dict[tuple[RunIdentity, str], Mapping[str, Any]]:
+def find(runs: Sequence[Mapping[str, Any]]) -> dict[RunKey, Mapping[str, Any]]:
     """Finished runs by `PlannedRun.key`.
 
     Args:
@@ -75,7 +78,7 @@ def find(runs: Sequence[Mapping[str, Any]]) -> dict[tuple[RunIdentity, str], Map
     Raises:
         ValueError: If two runs claim the same row, scene and seed: their data differ in content.
     """
-    found: dict[tuple[RunIdentity, str], Mapping[str, Any]] = {}
+    found: dict[RunKey, Mapping[str, Any]] = {}
     for run in runs:
         if "recipe" not in run:
             continue  # from before runs said so
