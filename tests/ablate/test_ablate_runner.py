@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import ablate_fakes
@@ -99,6 +100,20 @@ def test_rows_of_runs_csv_are_not_run_again_where_their_folders_are_gone(
     shutil.rmtree(results / "runs")
     assert ablate(request_of(table, results)) == 0
     assert len(ran(results)) == 6
+
+
+def test_the_page_keeps_the_tables_that_were_there(
+    table: Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    results, other = tmp_path / "r", replace(table, label="other")
+    known = {"other": other, "tiny": table, "third": replace(table, label="third")}
+    monkeypatch.setattr(runner, "load_tables", lambda: known)
+    for one in (table, other):
+        assert ablate(request_of(one, results)) == 0
+    page = (results / "synthetic" / "index.html").read_text()
+    assert "tab:tiny" in page
+    assert "tab:other" in page
+    assert "tab:third" not in page  # nobody asked for it
 
 
 def test_a_failure_is_shown_with_its_log_and_the_others_go_on(

@@ -199,9 +199,17 @@ def ablate(request: Request) -> int:
         return STOPPED
     if tally.failed and not read_metrics(results):
         return 1  # there is nothing to write yet
-    for path in write_all(results, request.tables, benchmark.name, html=True):
+    for path in write_all(results, _with_those_there(request), benchmark.name, html=True):
         console.print(visible(f"tables: {path}"), markup=False)
     return 1 if tally.failed else 0
+
+
+def _with_those_there(request: Request) -> list[Table]:
+    """The tables that were asked for, and those that the folder has already: its page shows all of them."""
+    folder = request.results / request.benchmark.name
+    found = {t.label: t for t in load_tables().values() if (folder / f"{t.label}.csv").is_file()}
+    found |= {table.label: table for table in request.tables}
+    return [found[label] for label in sorted(found)]
 
 
 def _run_missing(
@@ -249,7 +257,7 @@ def _run_missing(
             stopping.wait(WAIT_SECONDS)
 
 
-def _recorded(results: Path) -> dict[RunKey, Mapping[str, Any]]:
+def _recorded(results: Path) -> Mapping[RunKey, Mapping[str, Any]]:
     """Training times of the runs that stand in runs.csv, which tables are made of whether their folders are here or not.
 
     Raises:
