@@ -143,6 +143,17 @@ def test_where_every_run_fails_no_table_is_written(
     assert not (results / "runs.csv").exists()
 
 
+def test_where_every_new_run_fails_rows_of_runs_csv_are_still_written(table: Table, tmp_path: Path):
+    results = tmp_path / "r"
+    assert ablate(request_of(table, results)) == 0
+    shutil.rmtree(results / "runs")
+    page = results / "synthetic" / "tiny.md"
+    page.unlink()
+    behave(results, none1=["error"], self1=["error"])
+    assert ablate(request_of(table, results, seeds=(0, 1))) == 1
+    assert "50.0" in page.read_text()
+
+
 def test_a_killed_run_is_tried_again_but_not_for_ever(
     table: Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -26,9 +26,7 @@ class Serving:
         self.process.send_signal(signal.SIGINT)
         try:
             _, errors = self.process.communicate(timeout=30)
-        except (
-            subprocess.TimeoutExpired
-        ):  # seen once in some hundred times: what its threads do says why
+        except subprocess.TimeoutExpired:  # once in CI: what its threads do says why
             self.process.send_signal(signal.SIGABRT)
             _, errors = self.process.communicate(timeout=30)
             pytest.fail(f"it goes on after Ctrl-C:\n{errors}")

@@ -197,7 +197,7 @@ def ablate(request: Request) -> int:
     if stopping.is_set():
         console.print("stopped and saved; the same command goes on from here")
         return STOPPED
-    if tally.failed and not read_metrics(results):
+    if tally.failed and not recorded and not read_metrics(results):
         return 1  # there is nothing to write yet
     for path in write_all(results, _with_those_there(request), benchmark.name, html=True):
         console.print(visible(f"tables: {path}"), markup=False)
