@@ -105,37 +105,56 @@ struct Sums {
 // behind.
 enum class Need { kShape, kWeight, kValuesOnly };
 
-// Gradient by the weight and by the exponent in one block. toward[c] is the derivative of the loss by a T of
-// chain c. Where a Gaussian is not reached its alpha is 0, which leaves every bit of the state. kClamp:
-// whether a weight is so large that alpha_max may bind.
-template <class T, int kChains, Need kNeed, bool kClamp>
-VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *toward,
-                      Sums<T, kChains> &sums, Pack<T> *weights) {
-  const auto [o, falloff] = footprint(g, load(state + kCentreX * kLanes), load(state + kCentreY * kLanes));
-  const Pack<T> zero = splat(T(0)), one = splat(T(1)), alpha_max = splat(tile.alpha_max);
-  Pack<T> h = zero;
+// A Gaussian over one block. With registers to spare it is looked at while the block before is worked on:
+// when its turn comes it is known which chains it adds to, and a branch guessed wrong costs little.
+constexpr bool kLooksAhead = kNativeBytes == 64;
+template <class T, int kChains>
+struct Look {
+  const T *upstream;
+  T *state;
+  Footprint<T> print;
+  Mask<T> reached[kChains];
+};
+template <class T, int kChains>
+VLGS_INLINE Look<T, kChains> look_at(const Tile<T> &tile, const T *g, uint32_t blocks) {
+  const int64_t b = __builtin_ctz(blocks);
+  Look<T, kChains> look;
+  look.upstream = tile.upstream + b * tile.upstream_stride;
+  look.state = tile.state + b * state_size(kChains);
+  look.print = footprint(g, load(look.state + kCentreX * kLanes), load(look.state + kCentreY * kLanes));
   for (int c = 0; c < kChains; ++c) {
-    weights[c] = zero;
-    if (!tile.pass->used[c]) continue;
-    const T *chain = g + kChains0 + 2 * c;
-    T *mine = state + (kChainState + c * kChainStates) * kLanes;
-    const Mask<T> reached =
-        (o.exponent <= splat(chain[kCutoff])) & (splat(g[kPlace]) <= load(mine + kLast * kLanes));
-    const Pack<T> raw = splat(chain[kWeight]) * falloff;
-    const Pack<T> alpha = select(reached, kClamp ? min(raw, alpha_max) : raw, zero);
-    const Pack<T> t = load(mine + kTransmittance * kLanes) * reciprocal(one - alpha);
-    store(mine + kTransmittance * kLanes, t);
-    weights[c] = alpha * t;
-    if constexpr (kNeed == Need::kValuesOnly) continue;
-
-    const Pack<T> behind = load(mine + kBehind * kLanes), ahead = toward[c] - behind;
-    store(mine + kBehind * kLanes, fma(alpha, ahead, behind));
-    Pack<T> moved = weights[c] * ahead;
-    if constexpr (kClamp) moved = select(raw <= alpha_max, moved, zero);  // the clamp passes no gradient
-    sums.weight[c] = sums.weight[c] + moved;
-    if (kNeed == Need::kShape && tile.pass->shape_grad[c]) h = h + moved;
+    const T *last = look.state + (kChainState + c * kChainStates + kLast) * kLanes;
+    look.reached[c] =
+        (look.print.o.exponent <= splat(g[kChains0 + 2 * c + kCutoff])) & (splat(g[kPlace]) <= load(last));
   }
-  if constexpr (kNeed != Need::kShape) return;
+  return look;
+}
+
+// One chain of a Gaussian in a block: returns a T, and adds to h, the derivative by the negative exponent.
+// toward is the derivative of the loss by a T. kClamp: whether a weight is so large that alpha_max may bind.
+template <class T, int kChain, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE Pack<T> step(const Tile<T> &tile, const T *g, const Look<T, kChains> &look, const Pack<T> &toward,
+                         Sums<T, kChains> &sums, Pack<T> &h) {
+  const Pack<T> zero = splat(T(0)), one = splat(T(1)), alpha_max = splat(tile.alpha_max);
+  T *mine = look.state + (kChainState + kChain * kChainStates) * kLanes;
+  const Pack<T> raw = splat(g[kChains0 + 2 * kChain + kWeight]) * look.print.falloff;
+  const Pack<T> alpha = select(look.reached[kChain], kClamp ? min(raw, alpha_max) : raw, zero);
+  const Pack<T> t = load(mine + kTransmittance * kLanes) * reciprocal(one - alpha);
+  store(mine + kTransmittance * kLanes, t);
+  const Pack<T> weight = alpha * t;
+  if constexpr (kNeed == Need::kValuesOnly) return weight;
+
+  const Pack<T> behind = load(mine + kBehind * kLanes), ahead = toward - behind;
+  store(mine + kBehind * kLanes, fma(alpha, ahead, behind));
+  Pack<T> moved = weight * ahead;
+  if constexpr (kClamp) moved = select(raw <= alpha_max, moved, zero);  // the clamp passes no gradient
+  sums.weight[kChain] = sums.weight[kChain] + moved;
+  if (kNeed == Need::kShape && tile.pass->shape_grad[kChain]) h = h + moved;
+  return weight;
+}
+
+template <class T, int kChains>
+VLGS_INLINE void add_moments(const Offset<T> &o, const Pack<T> &h, Sums<T, kChains> &sums) {
   const Pack<T> hu = h * o.u, hv = h * o.v;
   sums.moment[kMomentU] = sums.moment[kMomentU] + hu;
   sums.moment[kMomentV] = sums.moment[kMomentV] + hv;
@@ -144,30 +163,45 @@ VLGS_INLINE void step(const Tile<T> &tile, const T *g, T *state, const Pack<T> *
   sums.moment[kMomentVV] = fma(hv, o.v, sums.moment[kMomentVV]);
 }
 
+// A chain of which the Gaussian reaches no pixel in the block is passed over: alpha would be 0, which leaves
+// every bit of the state and of the sums. In trained scenes colour and language share a third of their
+// blocks.
+template <class T, int kChain, int kChains, int kParts, Need kNeed, bool kClamp>
+VLGS_INLINE void chain_narrow(const Tile<T> &tile, const T *g, const Look<T, kChains> &look,
+                              Sums<T, kChains> &sums, Pack<T> &h, Pack<T> *d_values) {
+  constexpr int kBegin = 3 * kChain, kEnd = kChains == 1 ? 3 * kParts : 3 * kChain + 3;
+  if (!tile.pass->used[kChain] || !any(look.reached[kChain])) return;
+  Pack<T> toward = splat(T(0));
+  if constexpr (kNeed != Need::kValuesOnly) {
+    toward = load(look.upstream + (4 * kParts + kChain) * kLanes);
+    for (int k = kBegin; k < kEnd; ++k)
+      toward = fma(splat(g[kValues + k]), load(look.upstream + (k / 3 * 4 + k % 3) * kLanes), toward);
+  }
+  const Pack<T> weight = step<T, kChain, kChains, kNeed, kClamp>(tile, g, look, toward, sums, h);
+  if (tile.pass->value_grads)
+    for (int k = kBegin; k < kEnd; ++k)
+      d_values[k] = fma(weight, load(look.upstream + (k / 3 * 4 + k % 3) * kLanes), d_values[k]);
+}
+
 // Parts of three channels, one per chain or all on one chain: their gradients are summed in registers too.
 template <class T, int kChains, int kParts, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian_narrow(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
-  const bool values = tile.pass->value_grads;
   Pack<T> all[kLanes];
   for (auto &a : all) a = splat(T(0));
   Sums<T, kChains> sums{};
   Pack<T> d_values[3 * kParts];
   for (auto &d : d_values) d = splat(T(0));
-  for (; blocks; blocks &= blocks - 1) {
-    const int64_t b = __builtin_ctz(blocks);
-    const T *upstream = tile.upstream + b * tile.upstream_stride;
-    Pack<T> toward[kChains], weights[kChains];
-    if constexpr (kNeed != Need::kValuesOnly)
-      for (int c = 0; c < kChains; ++c) {
-        toward[c] = load(upstream + (4 * kParts + c) * kLanes);
-        for (int k = 3 * c; k < (kChains == 1 ? 3 * kParts : 3 * c + 3); ++k)
-          toward[c] = fma(splat(g[kValues + k]), load(upstream + (k / 3 * 4 + k % 3) * kLanes), toward[c]);
-      }
-    step<T, kChains, kNeed, kClamp>(tile, g, tile.state + b * state_size(kChains), toward, sums, weights);
-    if (values)
-      for (int k = 0; k < 3 * kParts; ++k)
-        d_values[k] = fma(weights[kChains == 1 ? 0 : k / 3], load(upstream + (k / 3 * 4 + k % 3) * kLanes),
-                          d_values[k]);
+  Look<T, kChains> next;
+  if (kLooksAhead) next = look_at<T, kChains>(tile, g, blocks);
+  while (blocks) {
+    const Look<T, kChains> look = kLooksAhead ? next : look_at<T, kChains>(tile, g, blocks);
+    blocks &= blocks - 1;
+    if (kLooksAhead && blocks) next = look_at<T, kChains>(tile, g, blocks);
+    Pack<T> h = splat(T(0));
+    chain_narrow<T, 0, kChains, kParts, kNeed, kClamp>(tile, g, look, sums, h, d_values);
+    if constexpr (kChains == 2)
+      chain_narrow<T, 1, kChains, kParts, kNeed, kClamp>(tile, g, look, sums, h, d_values);
+    if constexpr (kNeed == Need::kShape) add_moments(look.print.o, h, sums);
   }
   for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
   for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
@@ -202,48 +236,66 @@ VLGS_INLINE void value_gradients(const Tile<T> &tile, int chain, uint32_t blocks
   for (int k = 0; k < kWidth; ++k) slot[k] = sums[k];
 }
 
+// The first channels are summed together with the moments, which leave that much room.
+template <Need kNeed>
+constexpr int kLead = kNeed == Need::kValuesOnly ? 0 : 4;
+
+// As chain_narrow; whether a pixel is reached.
+template <class T, int kChain, int kChains, Need kNeed, bool kClamp>
+VLGS_INLINE bool chain_wide(const Tile<T> &tile, const T *g, const Look<T, kChains> &look,
+                            Sums<T, kChains> &sums, Pack<T> &h, Pack<T> *lead) {
+  const Pass<T> &p = *tile.pass;
+  if (!p.used[kChain] || !any(look.reached[kChain])) return false;
+  Pack<T> toward = splat(T(0));
+  if constexpr (kNeed != Need::kValuesOnly) {
+    toward = load(look.upstream + (p.padded_channels + kChain) * kLanes);
+    const T *upstream = look.upstream;
+    for (int i = 0; i < p.num_parts; ++i) {
+      const Part<T> &part = p.parts[i];
+      if (part.chain == kChain && part.d_image)
+        toward = project_values(part.values + row_of(g) * part.channels, upstream, part.channels, toward);
+      upstream += part.padded * kLanes;
+    }
+  }
+  const Pack<T> weight = step<T, kChain, kChains, kNeed, kClamp>(tile, g, look, toward, sums, h);
+  store(look.state + (kChainState + kChain * kChainStates + kAlphaT) * kLanes, weight);
+  if (p.parts[0].chain == kChain)
+    for (int k = 0; k < kLead<kNeed>; ++k) lead[k] = fma(weight, load(look.upstream + k * kLanes), lead[k]);
+  return true;
+}
+
 template <class T, int kChains, Need kNeed, bool kClamp>
 inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
-  // The first channels are summed together with the moments, which leave that much room.
-  constexpr int kLead = kNeed == Need::kValuesOnly ? 0 : 4;
   const Pass<T> &p = *tile.pass;
-  const int64_t row = row_of(g);
   const Part<T> &front = p.parts[0];
   Sums<T, kChains> sums{};
-  Pack<T> lead[kLead + 1];
+  Pack<T> lead[kLead<kNeed> + 1];
   for (auto &l : lead) l = splat(T(0));
-  for (uint32_t rest = blocks; rest; rest &= rest - 1) {
-    const int64_t b = __builtin_ctz(rest);
-    const T *upstream = tile.upstream + b * tile.upstream_stride;
-    Pack<T> toward[kChains], weights[kChains];
-    if constexpr (kNeed != Need::kValuesOnly) {
-      for (int c = 0; c < kChains; ++c) toward[c] = load(upstream + (p.padded_channels + c) * kLanes);
-      for (int i = 0; i < p.num_parts; ++i) {
-        const Part<T> &part = p.parts[i];
-        if (part.d_image)
-          toward[part.chain] =
-              project_values(part.values + row * part.channels, upstream, part.channels, toward[part.chain]);
-        upstream += part.padded * kLanes;
-      }
-    }
-    T *state = tile.state + b * state_size(kChains);
-    step<T, kChains, kNeed, kClamp>(tile, g, state, toward, sums, weights);
-    for (int c = 0; c < kChains; ++c)
-      store(state + (kChainState + c * kChainStates + kAlphaT) * kLanes, weights[c]);
-    upstream = tile.upstream + b * tile.upstream_stride;
-    for (int k = 0; k < kLead; ++k) lead[k] = fma(weights[front.chain], load(upstream + k * kLanes), lead[k]);
+  uint32_t reached[kChains] = {};  // blocks
+  Look<T, kChains> next;
+  if (kLooksAhead) next = look_at<T, kChains>(tile, g, blocks);
+  while (blocks) {
+    const Look<T, kChains> look = kLooksAhead ? next : look_at<T, kChains>(tile, g, blocks);
+    const uint32_t block = blocks & -blocks;
+    blocks &= blocks - 1;
+    if (kLooksAhead && blocks) next = look_at<T, kChains>(tile, g, blocks);
+    Pack<T> h = splat(T(0));
+    if (chain_wide<T, 0, kChains, kNeed, kClamp>(tile, g, look, sums, h, lead)) reached[0] |= block;
+    if constexpr (kChains == 2)
+      if (chain_wide<T, 1, kChains, kNeed, kClamp>(tile, g, look, sums, h, lead)) reached[1] |= block;
+    if constexpr (kNeed == Need::kShape) add_moments(look.print.o, h, sums);
   }
   if constexpr (kNeed != Need::kValuesOnly) {
     Pack<T> all[kLanes];
     for (auto &a : all) a = splat(T(0));
     for (int i = 0; i < 5; ++i) all[i] = sums.moment[i];
     for (int c = 0; c < kChains; ++c) all[kSlotWeight0 + c] = sums.weight[c];
-    for (int k = 0; k < kLead; ++k) all[kSlotHead + k] = lead[k];
+    for (int k = 0; k < kLead<kNeed>; ++k) all[kSlotHead + k] = lead[k];
     T head[kLanes];
     sum_lanes(all, head);
     for (int i = 0; i < kSlotHead; ++i) slot[i] = head[i];
     if (front.value_grad)
-      for (int k = 0; k < kLead; ++k) slot[front.slot + k] = head[kSlotHead + k];
+      for (int k = 0; k < kLead<kNeed>; ++k) slot[front.slot + k] = head[kSlotHead + k];
   } else {
     for (int i = 0; i < kSlotHead; ++i) slot[i] = 0;
   }
@@ -252,14 +304,15 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
   for (int i = 0; i < p.num_parts; ++i) {
     const Part<T> &part = p.parts[i];
     T *to = slot + part.slot;
-    int64_t k = i == 0 ? kLead : 0;
+    int64_t k = i == 0 ? kLead<kNeed> : 0;
     if (part.value_grad) {
+      const uint32_t in = reached[part.chain];
       for (; k + 16 <= part.padded; k += 16)
-        value_gradients<T, kChains, 16>(tile, part.chain, blocks, offset + k, to + k);
+        value_gradients<T, kChains, 16>(tile, part.chain, in, offset + k, to + k);
       const int64_t left = part.padded - k;
-      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, blocks, offset + k, to + k);
-      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, blocks, offset + k, to + k);
+      if (left == 12) value_gradients<T, kChains, 12>(tile, part.chain, in, offset + k, to + k);
+      if (left == 8) value_gradients<T, kChains, 8>(tile, part.chain, in, offset + k, to + k);
+      if (left == 4) value_gradients<T, kChains, 4>(tile, part.chain, in, offset + k, to + k);
     }
     offset += part.padded;
   }
