@@ -40,13 +40,13 @@ void neighbours_backward_row(const Neighbours<T> &n, int64_t y) {
     for (int k = 7; k >= 0; --k) {
       const int place = k < 4 ? k : k + 1;  // in the 3x3 pixels around an inner one
       const int64_t dy = place / 3, dx = place % 3;
-      const T *const d_products = n.d_products + k * rows * columns;
+      const int64_t of_place = k * rows * columns;  // in d_products, which is null without an inner pixel
       if (within(y - dy, rows) && within(x - dx, columns))
         beside.add(n.image + ((y - dy + 1) * n.width + x - dx + 1) * n.channels,
-                   d_products[(y - dy) * columns + x - dx]);
+                   n.d_products[of_place + (y - dy) * columns + x - dx]);
       if (is_inner)
         inner.add(n.image + ((y + dy - 1) * n.width + x + dx - 1) * n.channels,
-                  d_products[(y - 1) * columns + x - 1]);
+                  n.d_products[of_place + (y - 1) * columns + x - 1]);
     }
     T *const to = n.d_image + (y * n.width + x) * n.channels;
     int64_t i = 0;
