@@ -113,6 +113,16 @@ def test_where_nothing_lies_it_is_zero(kind: DepthKind):
     assert not depth_of(stack([], []), kind)[0].any()
 
 
+def test_a_mean_of_the_largest_numbers_is_one():
+    largest = torch.finfo(torch.float32).max
+    means, quats = torch.tensor([[0.0, 0.0, largest]] * 3), torch.eye(4)[:1].expand(3, 4)
+    K = torch.tensor([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]])
+    scales, opacities = torch.full((3, 3), largest / 3), torch.tensor([0.8, 0.2, 0.6])
+    depth = render_depth(means, quats, scales, opacities, torch.eye(4), K, 16, 16)
+    assert depth.isfinite().all()
+    assert (depth == largest).any()
+
+
 @pytest.mark.parametrize("stop", ["after", "before"])
 @pytest.mark.parametrize("first", [0, 12])
 def test_random_scenes(first: int, stop: str):

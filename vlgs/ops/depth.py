@@ -75,7 +75,9 @@ def render_depth(
             return image[..., 0]
         # Summed as the depths are: the accumulated weight, 1 - T, has lost the digits of what is faint.
         depth, total = image.unbind(dim=-1)
-        return depth / torch.where(total > 0, total, 1.0)
+        mean = depth / torch.where(total > 0, total, 1.0)
+        # A mean of the largest numbers there are may round beyond them.
+        return mean.clamp_max(torch.finfo(mean.dtype).max)
     if kind != "median":
         raise ValueError(f"depth: kind must be accumulated, expected or median, got {kind!r}")
     with torch.no_grad():
