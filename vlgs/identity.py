@@ -84,6 +84,8 @@ AS_WITHOUT: Mapping[str, Any] = {
     "indicator.copies": 1,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),
+    **dict.fromkeys(("lift.border", "lift.alike"), 0),
+    **dict.fromkeys(("stages.lift.border", "stages.lift.alike"), 0),
     "query.masks": None,
     "stages": None,
     "trainer.color_decay": 1,

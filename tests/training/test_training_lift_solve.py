@@ -2,9 +2,12 @@
 
 from copy import copy
 from dataclasses import replace
+from math import ceil
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from test_training_lift_rules import dense_weights
 from tiny_runs import composed
 from torch import Tensor
@@ -120,6 +123,61 @@ def test_large_views_are_solved_at_some_of_their_pixels(model: SplatModel, scene
     torch.testing.assert_close(weights @ got, weights @ want, rtol=1e-4, atol=1e-4)
 
 
+def blur_matrix(scene: Scene, sigma: float) -> Tensor:
+    """[p, p], block by block of every view, made of scipy's filter of every single pixel."""
+    blocks = []
+    for view in scene.train:
+        size = view.camera.height, view.camera.width
+        pixels = np.eye(size[0] * size[1]).reshape(-1, *size)
+        far = {"mode": "constant", "truncate": ceil(3 * sigma) / sigma}
+        columns = gaussian_filter(pixels, (0, sigma, sigma), **far)
+        blocks.append(torch.from_numpy(columns.reshape(len(pixels), -1).T.copy()))
+    return torch.block_diag(*blocks)
+
+
+def alike_matrix(model: SplatModel, mass: Tensor, strength: float) -> Tensor:
+    """[n, n], pair by pair."""
+    gaussians, n = model.gaussians(), len(mass)
+    color = model.fuse().color.detach()
+    away = (gaussians.means[:, None] - gaussians.means).norm(dim=-1).detach()
+    near = [set(row.tolist()) for row in away.fill_diagonal_(torch.inf).argsort(1)[:, :8]]
+    matrix = torch.zeros(n, n, dtype=torch.float64)
+    for i in range(n):
+        for j in range(i):
+            if (j in near[i] or i in near[j]) and mass[i] + mass[j] > 0:
+                likeness = float(torch.exp(-(color[i] - color[j]).square().sum() / (2 * 0.1**2)))
+                weight = strength / 8 * likeness * 2 * mass[i] * mass[j] / (mass[i] + mass[j])
+                edge = torch.zeros(n, dtype=torch.float64)
+                edge[i], edge[j] = 1, -1
+                matrix += weight * torch.outer(edge, edge)
+    return matrix
+
+
+@pytest.mark.parametrize(("border", "strength"), [(1.3, 0.0), (0.0, 2.0), (0.7, 0.5)])
+def test_borders_and_likeness_are_part_of_the_system(
+    model: SplatModel, scene: Scene, border: float, strength: float
+):
+    vectors = vectors_of(scene)
+    weights, index, trust = system(model, scene, 0.4)
+    targets = vectors[index.clamp_min(0).long()] * (index >= 0)[:, None]
+    mass = (weights.T @ (trust[:, None] * weights)).sum(1)
+    if border:
+        blur = blur_matrix(scene, border)
+        weights, targets = blur @ weights, targets * blur.sum(1, keepdim=True)
+    start = Consensus(0.4).combine(mask_weights(model, scene), vectors)
+    left = weights.T @ (trust[:, None] * weights) + 0.2 * torch.diag(mass)
+    right = weights.T @ (trust[:, None] * targets) + 0.2 * mass[:, None] * start
+    likeness = alike_matrix(model, mass, strength)
+    assert bool((likeness != 0).any()) == bool(strength)
+    want = torch.linalg.lstsq(left + likeness, right, driver="gelsd").solution
+    solver = Solve(0.4, steps=60, prior=0.2, border=border, alike=strength)
+    got = solver.refine(model, scene, 0, vectors, start)
+    torch.testing.assert_close(weights @ got, weights @ want, rtol=1e-4, atol=1e-4)
+    plain = Solve(0.4, steps=60, prior=0.2).refine(model, scene, 0, vectors, start)
+    assert (got - plain).abs().max() > 1e-2, "they say something"
+    assert not got[7].any(), "what no view sees says nothing"
+
+
 def test_conjugate_gradients_solve_as_many_unknowns_in_as_many_steps():
     generator = torch.Generator().manual_seed(0)
     root = torch.randn(6, 6, dtype=torch.float64, generator=generator)
@@ -143,3 +201,7 @@ def test_options_are_the_defaults():
         Solve(pixels=-1)
     with pytest.raises(ValueError, match="solve: prior must be"):
         Solve(prior=0.0)
+    with pytest.raises(ValueError, match="solve: border must be"):
+        Solve(border=-1.0)
+    with pytest.raises(ValueError, match="solve: alike must be"):
+        Solve(alike=float("nan"))

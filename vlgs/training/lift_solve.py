@@ -6,18 +6,25 @@ a Gaussian is wide.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vlgs.fields.splat import SplatModel
+from vlgs.gaussians.neighbors import nearest, pairs
 from vlgs.heads.threads import one_thread
+from vlgs.training.blur import blurred
 from vlgs.training.lift_rules import Consensus
 from vlgs.training.mask_weights import MaskedView, masked_views
 from vlgs.types import Scene
 from vlgs.values import require_range
+
+NEIGHBOURS = 8
+"""Nearest Gaussians that one is compared with, see `Solve.alike`."""
+COLOR = 0.1
+"""Standard deviation of what counts as one colour, a distance in RGB."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +35,12 @@ class Solve(Consensus):
     is 0. The prior decides where a Gaussian stands behind others, and keeps codes from swinging to explain faulty masks. Splat Feature Solver
     (Xiong et al., 2025) sees lifting as least squares too, and takes the weighted mean for its solution.
 
+    Masks end some pixels beside the edge of a thing, elsewhere in every view. Of a thing that is hardly wider their mean has more of what is behind than of
+    itself. `border` blurs the images as such masks are blurred on the mean, so that the codes are those of what was blurred; `alike` holds what is sharpened
+    so to what photographs say of edges, by ``alike sum_ij a_ij |f_i - f_j|^2`` over neighbours, where a_ij falls with the distance of their colours.
+
     Raises:
-        ValueError: If `absent` is not in [0, 1], `prior` is not positive, or `steps` or `pixels` is negative.
+        ValueError: If `absent` is not in [0, 1], `prior` is not positive, or another number is negative.
     """
 
     steps: int = 4
@@ -37,12 +48,18 @@ class Solve(Consensus):
     prior: float = 0.1
     pixels: int = 250_000
     """Most of a view; of a larger one every n-th of every n-th row counts, for the smallest n that is enough. 0: all."""
+    border: float = 0.0
+    """Standard deviation of where masks end about the edges of things, in pixels; 0: they end there."""
+    alike: float = 0.0
+    """How strongly neighbours of one colour are held to one code, beside what they weigh; 0: not at all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_range("solve", 0, 10_000, steps=self.steps)
         require_range("solve", 0, 2**31, pixels=self.pixels)
         require_range("solve", 1e-6, 1e6, prior=self.prior)
+        require_range("solve", 0, 100, border=self.border)
+        require_range("solve", 0, 1e6, alike=self.alike)
 
     def refine(
         self,
@@ -58,14 +75,21 @@ class Solve(Consensus):
         with torch.no_grad():
             weight = model.fuse().language_weight
         weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
-        system = _System(model, weight, scene, level, vectors, self.absent, self.pixels)
-        mass = system.gathered(torch.ones_like(start[:, :1]))
-        scale = 1 / ((1 + self.prior) * mass).clamp_min(torch.finfo(mass.dtype).tiny)
+        sharp = _System(model, weight, scene, level, vectors, self.absent, self.pixels)
+        mass = sharp.gathered(torch.ones_like(start[:, :1]))
+        system = replace(sharp, border=self.border)
+        held = self.prior * mass
+        missing, diagonal = system.missing(start), (1 + self.prior) * mass
+        alike = _Alike.of(model, self.alike, mass[:, 0]) if self.alike else None
+        if alike is not None:
+            missing, diagonal = missing - alike.apart(start), diagonal + alike.diagonal()
+        scale = 1 / diagonal.clamp_min(torch.finfo(mass.dtype).tiny)
 
         def product(codes: Tensor) -> Tensor:
-            return system.gathered(codes) + self.prior * mass * codes
+            pushed = system.gathered(codes) + held * codes
+            return pushed if alike is None else pushed + alike.apart(codes)
 
-        return conjugate_gradients(product, system.missing(start), scale, start, self.steps)
+        return conjugate_gradients(product, missing, scale, start, self.steps)
 
 
 @torch.no_grad()
@@ -119,6 +143,7 @@ class _System:
     vectors: Float[Tensor, "m t"]
     absent: float
     pixels: int
+    border: float = 0.0
 
     def gathered(self, codes: Float[Tensor, "n t"]) -> Float[Tensor, "n t"]:
         """``W^T T W codes``."""
@@ -135,12 +160,15 @@ class _System:
             values = codes.detach().requires_grad_()
             with torch.enable_grad():
                 image = self.model.render_values(view.camera, values, self.weight, view.step)
-                error = image.detach()
-                if wanted:
-                    error = (
-                        error - self.vectors[index.clamp_min(0).long()] * (index >= 0)[..., None]
-                    )
-                total += torch.autograd.grad(image, values, trust * error)[0]
+            border = self.border / view.step
+            error = blurred(image.detach(), border)
+            if wanted:
+                target = self.vectors[index.clamp_min(0).long()] * (index >= 0)[..., None]
+                if border:  # an image without language is 0 beyond its border, too
+                    target = target * blurred(torch.ones_like(trust), border)
+                error = error - target
+            error = blurred(trust * error, border)
+            total += torch.autograd.grad(image, values, error)[0]
         return total
 
     def _looks(self) -> Iterator[tuple[MaskedView, Float[Tensor, "h w 1"]]]:
@@ -151,3 +179,41 @@ class _System:
             if view.covered is not None:
                 trust = trust * (view.covered[..., None] | masked)
             yield view, trust
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """``sum_ij weight_ij |f_i - f_j|^2 / 2`` over pairs of neighbours."""
+
+    one: Int[Tensor, " p"]
+    other: Int[Tensor, " p"]
+    weight: Float[Tensor, "p 1"]
+    count: int
+
+    @classmethod
+    def of(cls, model: SplatModel, strength: float, mass: Float[Tensor, " n"]) -> "_Alike":
+        """Pairs weigh what the lighter of the two does, up to a factor of 2, so that neither is drawn by what is hardly seen."""
+        with torch.no_grad():
+            color = model.fuse().color
+            one, other = pairs(nearest(model.gaussians().means, NEIGHBOURS))
+            near = (color[one] - color[other]).square().sum(dim=1)
+            both = (mass[one] + mass[other]).clamp_min(torch.finfo(mass.dtype).tiny)
+            weight = (near / (-2 * COLOR**2)).exp() * mass[one] * mass[other] / both
+        weight = strength * 2 / NEIGHBOURS * weight
+        return cls(one, other, weight[:, None], len(mass))
+
+    def apart(self, codes: Float[Tensor, "n t"]) -> Float[Tensor, "n t"]:
+        """Half of the gradient."""
+        pull = self.weight * (codes[self.one] - codes[self.other])
+        return self._summed(pull, -pull)
+
+    def diagonal(self) -> Float[Tensor, "n 1"]:
+        """Of the matrix that `apart` is."""
+        return self._summed(self.weight, self.weight)
+
+    def _summed(
+        self, ones: Float[Tensor, "p t"], others: Float[Tensor, "p t"]
+    ) -> Float[Tensor, "n t"]:
+        with one_thread():  # the order of a sum would depend on the number of threads
+            total = ones.new_zeros(self.count, ones.shape[1])
+            return total.index_add_(0, self.one, ones).index_add_(0, self.other, others)
