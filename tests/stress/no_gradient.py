@@ -48,6 +48,8 @@ NO_GRADIENT = {
     "vlgs.gaussians.init.parameters_of": "placed once",
     "vlgs.gaussians.init.distance_to_nearest": "of what is placed or pruned",
     "vlgs.gaussians.neighbors.mean_squared_distance": "placed once",
+    "vlgs.gaussians.neighbors.nearest": "numbers of rows",
+    "vlgs.gaussians.neighbors.pairs": "numbers of rows",
     "vlgs.gaussians.ply.read_ply": "from a file",
     "vlgs.gaussians.ply.parse_ply": "from a file",
     "vlgs.gaussians.validate.broken_rows": "a mask",
