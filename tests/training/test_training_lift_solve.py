@@ -95,7 +95,10 @@ def test_enough_steps_solve_the_system(
     assert cost(want) < costs[4] < 0.95 * costs[0]
 
 
-def test_large_views_are_solved_at_some_of_their_pixels(model: SplatModel, scene: Scene):
+@pytest.mark.parametrize("border", [0.0, 2.6])
+def test_large_views_are_solved_at_some_of_their_pixels(
+    model: SplatModel, scene: Scene, border: float
+):
     model = copy(model)
     model.raster = replace(model.raster, fov_margin=1e6)  # what is clamped depends on the image
     vectors = vectors_of(scene)
@@ -111,11 +114,14 @@ def test_large_views_are_solved_at_some_of_their_pixels(model: SplatModel, scene
     )  # fmt: skip
     weights, index, trust = weights[kept], index[kept], trust[kept]
     pixels = int(kept.sum()) // 2
-    solver = Solve(steps=40, prior=0.1, pixels=pixels)
+    solver = Solve(steps=40, prior=0.1, pixels=pixels, border=border)
     start = solver.combine(mask_weights(model, scene, pixels=pixels), vectors)
-    normal = weights.T @ (trust[:, None] * weights)
-    held = 0.1 * torch.diag(normal.sum(1))
+    held = 0.1 * torch.diag((weights.T @ (trust[:, None] * weights)).sum(1))
     targets = vectors[index.clamp_min(0).long()] * (index >= 0)[:, None]
+    if border:  # in pixels of the photograph
+        blur = blur_matrix(scene, border / step, step)
+        weights, targets = blur @ weights, targets * blur.sum(1, keepdim=True)
+    normal = weights.T @ (trust[:, None] * weights)
     want = torch.linalg.lstsq(
         normal + held, weights.T @ (trust[:, None] * targets) + held @ start, driver="gelsd"
     ).solution
@@ -123,11 +129,11 @@ def test_large_views_are_solved_at_some_of_their_pixels(model: SplatModel, scene
     torch.testing.assert_close(weights @ got, weights @ want, rtol=1e-4, atol=1e-4)
 
 
-def blur_matrix(scene: Scene, sigma: float) -> Tensor:
+def blur_matrix(scene: Scene, sigma: float, step: int = 1) -> Tensor:
     """[p, p], block by block of every view, made of scipy's filter of every single pixel."""
     blocks = []
     for view in scene.train:
-        size = view.camera.height, view.camera.width
+        size = ceil(view.camera.height / step), ceil(view.camera.width / step)
         pixels = np.eye(size[0] * size[1]).reshape(-1, *size)
         far = {"mode": "constant", "truncate": ceil(3 * sigma) / sigma}
         columns = gaussian_filter(pixels, (0, sigma, sigma), **far)

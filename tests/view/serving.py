@@ -26,7 +26,7 @@ class Serving:
         self.process.send_signal(signal.SIGINT)
         try:
             _, errors = self.process.communicate(timeout=30)
-        except subprocess.TimeoutExpired:  # once in CI: what its threads do says why
+        except subprocess.TimeoutExpired:  # what its threads do says why
             self.process.send_signal(signal.SIGABRT)
             _, errors = self.process.communicate(timeout=30)
             pytest.fail(f"it goes on after Ctrl-C:\n{errors}")
@@ -38,14 +38,18 @@ def serving(*arguments: str) -> Iterator[Serving]:
     """`python -m vlgs.view` with a port that is free, until the end of the block."""
     pytest.importorskip("viser", reason="needs viser: pip install 'vlgs[viewer]'")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
+    # Where pytest runs in the background of a shell, what it starts would ignore Ctrl-C as it does itself.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen(
         [sys.executable, "-X", "faulthandler", "-m", "vlgs.view", *arguments, "--port", "0"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
         cwd=ROOT,
-    ) as process:
+    )
+    signal.signal(signal.SIGINT, before)
+    with process:
         try:
             assert process.stdout is not None
             said = process.stdout.readline()

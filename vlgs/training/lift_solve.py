@@ -37,7 +37,8 @@ class Solve(Consensus):
 
     Masks end some pixels beside the edge of a thing, elsewhere in every view. Of a thing that is hardly wider their mean has more of what is behind than of
     itself. `border` blurs the images as such masks are blurred on the mean, so that the codes are those of what was blurred; `alike` holds what is sharpened
-    so to what photographs say of edges, by ``alike sum_ij a_ij |f_i - f_j|^2`` over neighbours, where a_ij falls with the distance of their colours.
+    so to what photographs say of edges, by ``alike sum_ij a_ij |f_i - f_j|^2`` over pairs of neighbours, where a_ij grows with what both weigh and falls with
+    the distance of their colours.
 
     Raises:
         ValueError: If `absent` is not in [0, 1], `prior` is not positive, or another number is negative.
@@ -183,7 +184,7 @@ class _System:
 
 @dataclass(frozen=True)
 class _Alike:
-    """``sum_ij weight_ij |f_i - f_j|^2 / 2`` over pairs of neighbours."""
+    """``sum_ij weight_ij |f_i - f_j|^2``, over each pair of neighbours once."""
 
     one: Int[Tensor, " p"]
     other: Int[Tensor, " p"]
@@ -196,9 +197,9 @@ class _Alike:
         with torch.no_grad():
             color = model.fuse().color
             one, other = pairs(nearest(model.gaussians().means, NEIGHBOURS))
-            near = (color[one] - color[other]).square().sum(dim=1)
+            apart = (color[one] - color[other]).square().sum(dim=1)
             both = (mass[one] + mass[other]).clamp_min(torch.finfo(mass.dtype).tiny)
-            weight = (near / (-2 * COLOR**2)).exp() * mass[one] * mass[other] / both
+            weight = (apart / (-2 * COLOR**2)).exp() * mass[one] * mass[other] / both
         weight = strength * 2 / NEIGHBOURS * weight
         return cls(one, other, weight[:, None], len(mass))
 
