@@ -78,7 +78,10 @@ def test_candidates_are_those_of_transformers(weights: Path):
                 masks[:, k : k + 1], out.iou_scores[0, :, k : k + 1], image.shape[:2],
                 [crop.x1, crop.y1, crop.x2, crop.y2], 0.05, 0.5,
             )  # fmt: skip
-            np.testing.assert_allclose([c.predicted_iou for c in candidates], scores, rtol=1e-4)
+            # Scores of random weights reach 11; points decoded 5 at a time differ from 16 at a time by up to 3.1e-5 in
+            # float32 (a CPU without AVX-512; float32 itself is off float64 by up to 3e-3).
+            found_scores = [c.predicted_iou for c in candidates]
+            np.testing.assert_allclose(found_scores, scores, rtol=1e-4, atol=1e-4)
             got = np.array([c.mask.box for c in candidates]).reshape(-1, 4) - [0, 0, 1, 1]
             np.testing.assert_allclose(got, boxes.reshape(-1, 4))
             compared += len(candidates)
