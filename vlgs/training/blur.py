@@ -1,5 +1,6 @@
 """Gaussian blur of a map with many channels."""
 
+from collections.abc import Iterator
 from math import ceil
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from vlgs.heads.threads import one_thread
 
 BLOCK = 32
-"""Rows that one product gives: few enough that most of what is multiplied is not 0, enough that it is a product of matrices."""
+"""Rows and columns that one product gives: few enough that most of what is multiplied is not 0, enough that it is a product of matrices."""
 REACH = 3
 """Standard deviations after which the kernel ends."""
 
@@ -18,7 +19,8 @@ REACH = 3
 def blurred(image: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
     """Sums over the neighbours of every pixel, which weigh 1 together; what lies outside of the image is 0. The map is its own transpose.
 
-    As products with banded matrices: kornia's convolution takes as long at 200x150 and five times as long at 493x364, 32 channels.
+    As products with banded matrices, down some rows and then along them while they are in the cache. kornia's convolution takes as long at 200x150
+    and five times as long at 493x364 with 32 channels as whole columns and then whole rows, which take three times as long as this with 96.
 
     Args:
         image: Finite.
@@ -26,22 +28,26 @@ def blurred(image: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c
     """
     if not sigma:
         return image
+    height, width, channels = image.shape
+    rows, out = image.reshape(height, -1), torch.empty_like(image)
+    down, along = _bands(height, sigma, image), list(_bands(width, sigma, image))
     with one_thread():  # the last bits of products depend on the number of threads
-        return _down(_down(image, sigma).transpose(0, 1), sigma).transpose(0, 1).contiguous()
+        for above, own, band in down:
+            part = torch.mm(band, rows[above]).view(-1, width, channels)
+            for beside, columns, weights in along:
+                out[own, columns] = weights @ part[:, beside]
+    return out
 
 
-def _down(image: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
-    """Along columns."""
-    rows, reach = image.flatten(1), ceil(REACH * sigma)
+def _bands(length: int, sigma: float, like: Tensor) -> Iterator[tuple[slice, slice, Tensor]]:
+    """Of every block of pixels: those that reach it, itself, and what each of the first weighs in each of the second."""
+    reach = ceil(REACH * sigma)
     away = torch.arange(-reach, reach + 1, dtype=torch.float64)
     kernel = (away / sigma).square().mul(-0.5).exp()
-    kernel = (kernel / kernel.sum()).to(image)
-    out = torch.empty_like(rows)
-    for first in range(0, len(rows), BLOCK):
-        last = min(first + BLOCK, len(rows))
-        low, high = max(0, first - reach), min(len(rows), last + reach)
+    kernel = (kernel / kernel.sum()).to(like)
+    for first in range(0, length, BLOCK):
+        last = min(first + BLOCK, length)
+        low, high = max(0, first - reach), min(length, last + reach)
         lag = torch.arange(low, high) - torch.arange(first, last)[:, None] + reach
         inside = (lag >= 0) & (lag <= 2 * reach)
-        band = kernel[lag.clamp(0, 2 * reach)] * inside
-        torch.mm(band, rows[low:high], out=out[first:last])
-    return out.view_as(image)
+        yield slice(low, high), slice(first, last), kernel[lag.clamp(0, 2 * reach)] * inside

@@ -4,6 +4,7 @@ Throughout, w_ip is the blending weight of Gaussian i at pixel p of a training v
 that have a mask. A Gaussian that none of them shows keeps the code zero, which answers no word.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -52,18 +53,16 @@ class Refining(Protocol):
         self,
         model: SplatModel,
         scene: Scene,
-        level: int,
         vectors: Float[Tensor, "m t"],
-        start: Float[Tensor, "n t"],
-    ) -> Float[Tensor, "n t"]:
-        """Codes of all Gaussians.
+        starts: Sequence[Float[Tensor, "n t"]],
+    ) -> Sequence[Float[Tensor, "n t"]]:
+        """Codes of all Gaussians, of every mask level.
 
         Args:
             model: Whose Gaussians.
             scene: Whose masks.
-            level: Place of the mask level.
             vectors: Targets of the masks.
-            start: From `LiftRule.combine`.
+            starts: From `LiftRule.combine`, level by level.
         """
         ...
 
@@ -233,11 +232,11 @@ def lift_by(rule: LiftRule, module: VLGSModule) -> None:
     """Set the codes of a module's Gaussians to what a rule makes of the masks of its scene, in place."""
     model, scene = module.model, module.views.scene
     vectors = model.head.targets(scene.mask_vectors.to(model.splats["features"]))
-    codes = []
-    for level in range(model.levels):
-        pixels = rule.pixels if isinstance(rule, Sampling) else None
-        made = rule.combine(mask_weights(model, scene, level, rule.share, pixels), vectors)
-        if isinstance(rule, Refining):
-            made = rule.refine(model, scene, level, vectors, made)
-        codes.append(made)
-    model.splats["features"].copy_(torch.cat(codes, dim=1))
+    pixels = rule.pixels if isinstance(rule, Sampling) else None
+    codes: Sequence[Tensor] = [
+        rule.combine(mask_weights(model, scene, level, rule.share, pixels), vectors)
+        for level in range(model.levels)
+    ]
+    if isinstance(rule, Refining):
+        codes = rule.refine(model, scene, vectors, codes)
+    model.splats["features"].copy_(torch.cat(list(codes), dim=1))

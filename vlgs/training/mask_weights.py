@@ -4,7 +4,7 @@ A view has a few dozen masks and thousands of pixels, so that language is lifted
 embeddings is ever made.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, sqrt
 
@@ -34,8 +34,8 @@ class MaskedView:
     """A training view that has masks, or every `step`-th pixel of every `step`-th row of it."""
 
     camera: Camera
-    index: Int[Tensor, "h w"]
-    """Row of `Scene.mask_vectors` per pixel, -1 where no mask lies."""
+    index: Int[Tensor, "h w"] | Int[Tensor, "h w l"]
+    """Row of `Scene.mask_vectors` per pixel, -1 where no mask lies; l mask levels where several are asked for."""
     covered: Bool[Tensor, "h w"] | None
     """Pixels that the photograph covers; None for all."""
     step: int
@@ -139,19 +139,25 @@ def _sorted(
     return gaussian, pairs.remainder_(masks).int(), weight
 
 
-def masked_views(scene: Scene, level: int = 0, pixels: int | None = None) -> Iterator[MaskedView]:
-    """The training views that have masks, with those of one level.
+def masked_views(
+    scene: Scene, level: int | Sequence[int] = 0, pixels: int | None = None
+) -> Iterator[MaskedView]:
+    """The training views that have masks, with those of one level or of some.
 
     Args:
         scene: Whose views.
-        level: Place of the mask level.
+        level: Place of the mask level, or places.
         pixels: Most of a view; a larger one is given by every n-th pixel of every n-th row, for the smallest n. None or 0: all.
     """
     for view in scene.train:
         if view.read_masks is not None:
             index = view.read_masks()
-            index = index if index.dim() == 2 else index[..., level]
-            step = max(1, ceil(sqrt(index.numel() / pixels))) if pixels else 1
+            if index.dim() == 3:
+                index = index[..., level if isinstance(level, int) else list(level)]
+            elif not isinstance(level, int):
+                index = index[..., None]
+            height, width = index.shape[:2]
+            step = max(1, ceil(sqrt(height * width / pixels))) if pixels else 1
             seen, camera = covered(view), view.camera
             if step > 1:
                 index, camera = index[::step, ::step], subsample_camera(camera, step)
