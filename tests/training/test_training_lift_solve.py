@@ -235,7 +235,7 @@ def judged(names: Collection[str], rule: Solve, model: SplatModel, scene: Scene)
     def unexplained(asked: System, codes: Tensor) -> float:
         return 10 - gains["border"] * bool(asked.border) - gains["alike"] * float(codes.max())
 
-    def solved(own: Solve, asked: System, start: Tensor) -> Tensor:
+    def solved(own: Solve, asked: System, mass: Tensor, start: Tensor) -> Tensor:
         assert own.steps == 2
         assert asked.levels == (0,)
         return torch.full_like(start, float(own.alike > 0))

@@ -18,7 +18,7 @@ from vlgs.heads.threads import one_thread
 from vlgs.training.lift_rules import Consensus
 from vlgs.training.lift_system import Alike, System
 from vlgs.training.mask_weights import mask_weights
-from vlgs.types import Scene
+from vlgs.types import Scene, View
 from vlgs.values import require_range
 
 log = logging.getLogger(__name__)
@@ -92,12 +92,14 @@ class Solve(Consensus):
             if self.trial and 0 in levels:
                 rule = self._tried(replace(system, levels=(0,)))
             start = torch.cat([starts[level] for level in levels], dim=1)
-            codes += rule._solved(system, start).split(vectors.shape[1], dim=1)
+            solved = rule._solved(system, system.masses(), start)
+            codes += solved.split(vectors.shape[1], dim=1)
         return codes
 
-    def _solved(self, sharp: System, start: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+    def _solved(
+        self, sharp: System, mass: Float[Tensor, "n l"], start: Float[Tensor, "n c"]
+    ) -> Float[Tensor, "n c"]:
         levels = len(sharp.levels)
-        mass = sharp.gathered(start.new_ones(len(start), levels))
 
         def wide(numbers: Float[Tensor, "n l"]) -> Float[Tensor, "n c"]:
             return numbers.repeat_interleave(start.shape[1] // levels, dim=1)
@@ -122,15 +124,18 @@ class Solve(Consensus):
         left_out = tuple(views[TRIAL_EVERY - 1 :: TRIAL_EVERY])
         others = tuple(view for i, view in enumerate(views) if (i + 1) % TRIAL_EVERY)
         solved = replace(
-            system, scene=replace(system.scene, train=others), vectors=_leading(system.vectors)
+            system,
+            scene=replace(system.scene, train=others),
+            vectors=_leading(system.vectors),
+            pixels=_quarter(self.pixels, others),
         )
         asked = replace(solved, scene=replace(system.scene, train=left_out))
         [level] = system.levels
-        sums = mask_weights(system.model, solved.scene, level, self.share, self.pixels)
-        start = self.combine(sums, solved.vectors)
+        sums = mask_weights(system.model, solved.scene, level, self.share, solved.pixels)
+        start, mass = self.combine(sums, solved.vectors), solved.masses()
 
         def unexplained(rule: Solve) -> float:
-            codes = rule._solved(solved, start)
+            codes = rule._solved(solved, mass, start)
             return replace(asked, border=rule.border).unexplained(codes)
 
         kept = replace(self, steps=TRIAL_STEPS, border=0.0, alike=0.0, trial=False)
@@ -148,6 +153,12 @@ class Solve(Consensus):
                 if better:
                     kept, least = with_it, error
         return replace(kept, steps=self.steps)
+
+
+def _quarter(pixels: int, views: Sequence[View]) -> int:
+    """Of the pixels that count of a view: a trial tells as much from every second pixel of every second row."""
+    most = max((view.camera.width * view.camera.height for view in views), default=4)
+    return max(1, min(pixels or most, most) // 4)
 
 
 def _leading(vectors: Float[Tensor, "m t"]) -> Float[Tensor, "m k"]:

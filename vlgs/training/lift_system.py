@@ -1,7 +1,7 @@
 """What masks of all views say of the codes of Gaussians, as a linear system: products with its matrix, and none of the matrix itself."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -37,6 +37,11 @@ class System:
     def gathered(self, codes: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
         """``W^T T W codes``."""
         return self._back(codes, wanted=False)
+
+    def masses(self) -> Float[Tensor, "n l"]:
+        """What every Gaussian weighs in all images."""
+        sharp = replace(self, border=0.0)
+        return sharp.gathered(self.vectors.new_ones(len(self.weight), len(self.levels)))
 
     def missing(self, codes: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
         """``W^T T (H - W codes)``."""
@@ -78,6 +83,8 @@ class System:
     def _over(
         self, trust: Float[Tensor, "h w l"], error: Float[Tensor, "h w c"]
     ) -> Float[Tensor, "h w c"]:
+        if bool((trust == 1).all()):
+            return error
         return (trust[..., None] * error.unflatten(2, (len(self.levels), -1))).flatten(2)
 
     def _looks(self) -> Iterator[tuple[MaskedView, Float[Tensor, "h w l"]]]:
