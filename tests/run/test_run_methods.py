@@ -48,6 +48,9 @@ SHORTER = {
         "+stages.1.network={_target_: vlgs.fields.language_field.LanguageConfig, width: 32}",
     ),
     "opennerf": (*RAYS, "+stages.1.network.width=32"),
+    "fmgs": (
+        "+stages.1.network={_target_: vlgs.fields.language_field.LanguageConfig, width: 32, scaled: false, half: true}",
+    ),
     "legaussians": ("head.quantiser.steps=50",),
 }
 """Method -> what makes it quick, where an iteration, a view or the fit of the head takes long."""

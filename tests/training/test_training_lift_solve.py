@@ -233,11 +233,13 @@ def judged(names: Collection[str], rule: Solve, model: SplatModel, scene: Scene)
     gains = {name: 0.2 if name in names else 0.05 for name in ("border", "alike")}
 
     def unexplained(asked: System, codes: Tensor) -> float:
+        assert list(asked.scene.train) == [scene.train[3]]
         return 10 - gains["border"] * bool(asked.border) - gains["alike"] * float(codes.max())
 
     def solved(own: Solve, asked: System, mass: Tensor, start: Tensor) -> Tensor:
         assert own.steps == 2
         assert asked.levels == (0,)
+        assert list(asked.scene.train) == [scene.train[i] for i in (0, 1, 2, 4, 5)]
         return torch.full_like(start, float(own.alike > 0))
 
     with pytest.MonkeyPatch.context() as patch:
