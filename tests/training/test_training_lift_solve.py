@@ -267,6 +267,30 @@ def test_a_trial_keeps_what_foretells_better(
     assert judged(names, replace(rule, border=0.0), model, tiny_scene).border == 0
 
 
+@pytest.mark.parametrize("ragged", [False, True])
+def test_borders_are_kept_where_masks_end_beside_the_edges(
+    model: SplatModel, tiny_scene: Scene, ragged: bool
+):
+    """What a model renders of three things is masked as it is, or moved by some pixels in every view."""
+    vectors = torch.eye(5, dtype=torch.float64)[:3]
+    codes = vectors[torch.arange(model.count) % 3]
+    weight = model.fuse().language_weight.detach()
+    generator = torch.Generator().manual_seed(0)
+
+    def masked(view: View) -> View:
+        with torch.no_grad():
+            shares = model.render_values(view.camera, codes, weight)[..., :3]
+        away = (2.5 * torch.randn(2, generator=generator)).round().int().tolist()
+        masks = shares.argmax(-1).int().masked_fill(shares.sum(-1) < 0.5, -1)
+        moved = masks.roll(away, (0, 1)) if ragged else masks
+        return replace(view, read_masks=lambda: moved)
+
+    scene = replace(tiny_scene, train=tuple(masked(view) for view in tiny_scene.train))
+    whole = System(model, weight, scene, (0,), vectors, 1.0, 0)
+    kept = Solve(border=2.0, trial=True)._tried(whole)
+    assert kept == Solve(border=2.0 if ragged else 0.0)
+
+
 def test_without_a_view_to_ask_a_trial_keeps_nothing(model: SplatModel, scene: Scene):
     rule = Solve(steps=3, border=1.5, alike=3.0, trial=True)
     start = Consensus().combine(mask_weights(model, scene), vectors_of(scene))

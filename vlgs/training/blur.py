@@ -1,6 +1,6 @@
 """Gaussian blur of a map with many channels."""
 
-from collections.abc import Iterator
+from functools import lru_cache
 from math import ceil
 
 import torch
@@ -30,7 +30,7 @@ def blurred(image: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c
         return image
     height, width, channels = image.shape
     rows, out = image.reshape(height, -1), torch.empty_like(image)
-    down, along = _bands(height, sigma, image), list(_bands(width, sigma, image))
+    down, along = (_bands(length, sigma, image.dtype) for length in (height, width))
     with one_thread():  # the last bits of products depend on the number of threads
         for above, own, band in down:
             part = torch.mm(band, rows[above]).view(-1, width, channels)
@@ -39,15 +39,21 @@ def blurred(image: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c
     return out
 
 
-def _bands(length: int, sigma: float, like: Tensor) -> Iterator[tuple[slice, slice, Tensor]]:
-    """Of every block of pixels: those that reach it, itself, and what each of the first weighs in each of the second."""
+@lru_cache(maxsize=16)
+def _bands(
+    length: int, sigma: float, dtype: torch.dtype
+) -> tuple[tuple[slice, slice, Tensor], ...]:
+    """Of every block of pixels: those that reach it, itself, and what each of the first weighs in each of the second. All views ask for the same few."""
     reach = ceil(REACH * sigma)
     away = torch.arange(-reach, reach + 1, dtype=torch.float64)
     kernel = (away / sigma).square().mul(-0.5).exp()
-    kernel = (kernel / kernel.sum()).to(like)
+    kernel = (kernel / kernel.sum()).to(dtype)
+    bands = []
     for first in range(0, length, BLOCK):
         last = min(first + BLOCK, length)
         low, high = max(0, first - reach), min(length, last + reach)
         lag = torch.arange(low, high) - torch.arange(first, last)[:, None] + reach
         inside = (lag >= 0) & (lag <= 2 * reach)
-        yield slice(low, high), slice(first, last), kernel[lag.clamp(0, 2 * reach)] * inside
+        band = kernel[lag.clamp(0, 2 * reach)] * inside
+        bands.append((slice(low, high), slice(first, last), band))
+    return tuple(bands)

@@ -45,8 +45,8 @@ class Solve(Consensus):
     Masks end some pixels beside the edge of a thing, elsewhere in every view. Of a thing that is hardly wider their mean has more of what is behind than of
     itself. `border` blurs the images as such masks are blurred on the mean, so that the codes are those of what was blurred; `alike` holds what is sharpened
     so to what photographs say of edges, by ``alike sum_ij a_ij |f_i - f_j|^2`` over pairs of neighbours, where a_ij grows with what both weigh and falls with
-    the distance of their colours. Where masks end exactly, or things are of many colours and beside others of the same, both do harm: on `trial` they
-    have to show first that codes of some views foretell the masks of others better with than without.
+    the distance of their colours. Neither is right everywhere: with exact masks both together cost half a point of mIoU, on photographs of a street
+    `alike` costs two. On `trial` each has to show first that codes of some views foretell the masks of others better with it than without.
 
     Raises:
         ValueError: If `absent` is not in [0, 1], `prior` is not positive, or another number is negative.
@@ -90,7 +90,7 @@ class Solve(Consensus):
         rule, codes = self, []
         for levels, own in groups.items():
             system = System(model, own, scene, levels, vectors, self.absent, self.pixels)
-            if self.trial and 0 in levels:
+            if self.trial and (self.border or self.alike) and 0 in levels:
                 rule = self._tried(replace(system, levels=(0,)))
             start = torch.cat([starts[level] for level in levels], dim=1)
             solved = rule._solved(system, system.masses(), start)
