@@ -67,6 +67,18 @@ def write_scene(root: Path, n: int = 9, **model) -> list[str]:
     return [Path(name).stem for name in names]
 
 
+UTM = (500_123.25, 5_412_345.5, 312.125)
+
+
+def surveyed(root: Path, shift: tuple[float, float, float] = UTM) -> Path:
+    """The same scene in the coordinates of a map; pycolmap moves it."""
+    write_scene(root)
+    model = pycolmap.Reconstruction(str(root / "sparse" / "0"))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(shift)))
+    model.write(str(root / "sparse" / "0"))
+    return root
+
+
 def unit_rows(n: int, seed: int, width: int = 8) -> np.ndarray:
     rows = np.random.default_rng(seed).normal(size=(n, width))
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)

@@ -88,10 +88,12 @@ def subsample_camera(camera: Camera, step: int) -> Camera:
 
 
 def scene_extent(viewmats: Float[Tensor, "v 4 4"]) -> float:
-    """1.1 x the largest distance of a camera from the mean camera centre (3DGS); 1.0 for a single camera.
+    """1.1 x the largest distance of a camera from the mean camera centre (3DGS); 1.0 for cameras in one place.
 
     The learning rate of positions and the thresholds of densification are in this unit.
     """
     centers = camera_center(viewmats)
     radius = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
-    return 1.1 * radius if radius > 0 else 1.0
+    # Cameras that only turn have one centre up to the rounding of -R^T t.
+    rounding = 64 * torch.finfo(centers.dtype).eps * centers.norm(dim=-1).max().item()
+    return 1.1 * radius if radius > rounding else 1.0

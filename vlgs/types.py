@@ -109,6 +109,8 @@ class Scene:
     )
     """Where a scene can look from anywhere: camera and number -> language supervision as of a training view, with a row of its own
     vectors per pixel, or -1. Faults are a function of the number."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where in the world of its files the scene's coordinates begin (`vlgs.data.sparse.origin`)."""
     fingerprint: str = ""
     """Content hash of all that was read; two scenes with one fingerprint give one result."""
 

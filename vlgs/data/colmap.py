@@ -39,7 +39,16 @@ from vlgs.data.posed_images import (
     scale_faults,
 )
 from vlgs.data.source import ColmapSource, require_tree
-from vlgs.data.sparse import SparseModel, model_faults, read_sparse
+from vlgs.data.sparse import (
+    AT_HOME,
+    Origin,
+    SparseModel,
+    model_faults,
+    moved,
+    origin_of,
+    origin_warnings,
+    read_sparse,
+)
 from vlgs.data.views import ViewSource
 from vlgs.types import Scene, Vocabulary
 
@@ -73,6 +82,7 @@ class _Parts:
     """What a scene is put together from."""
 
     model: SparseModel
+    origin: Origin
     views: tuple[ViewSource, ...]
     labels: DenseFolder | ObjectFolder | None
     masks: MaskTable | None
@@ -122,6 +132,9 @@ def survey(source: ColmapSource) -> Survey:
     except SceneError as error:
         return Survey((error.fault,))
     faults = FaultList(model_faults(model))
+    origin = AT_HOME if errors(faults) else origin_of(model)
+    faults += origin_warnings(model, origin)
+    model = moved(model, origin)
     images = ImageFolder(
         source.folder / source.images, source.resize, PixelCache(source.cache_bytes)
     )
@@ -137,7 +150,7 @@ def survey(source: ColmapSource) -> Survey:
     vocabulary = faults.take(_open_vocabulary(source, masks))
     if errors(faults):
         return Survey(tuple(faults), model, views)
-    scene = _assemble(source, _Parts(model, views, labels, masks, vocabulary))
+    scene = _assemble(source, _Parts(model, origin, views, labels, masks, vocabulary))
     return Survey(tuple(faults), model, views, scene)
 
 
@@ -264,6 +277,7 @@ def _assemble(source: ColmapSource, parts: _Parts) -> Scene:
         class_kinds=kinds,
         vocabulary=parts.vocabulary,
         label_set=source.label_set,
+        origin=parts.origin,
         fingerprint=_fingerprint(source, parts),
     )
 
@@ -297,6 +311,8 @@ def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
     elif parts.labels is not None and parts.labels.classes is not None:
         marked = {stem: sorted(image.categories) for stem, image in parts.labels.images.items()}
         hasher.update(repr((parts.labels.classes, sorted(marked.items()))).encode())
+    if parts.origin != AT_HOME:
+        hasher.update(repr(parts.origin).encode())
     if source.label_set:
         hasher.update(source.label_set.encode())
     for view in parts.views:

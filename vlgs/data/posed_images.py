@@ -14,7 +14,6 @@ from vlgs.data.labels import DenseFolder, ObjectFolder
 from vlgs.data.lens import Lens, make_lens
 from vlgs.data.sparse import SparseCamera, SparseImage, SparseModel, camera_faults, image_faults
 from vlgs.data.views import ViewSource, map_sizes
-from vlgs.geometry import quat_to_rotmat
 from vlgs.types import Camera
 
 
@@ -182,13 +181,10 @@ def _stray_labels(
 def _make_view(
     image: SparseImage, camera: SparseCamera, photograph: Photograph, lens: Lens, cache: PixelCache
 ) -> ViewSource:
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = quat_to_rotmat(torch.tensor(image.quat, dtype=torch.float64))
-    viewmat[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
     K = torch.from_numpy(lens.intrinsics())
     return ViewSource(
         name=Path(image.name).stem,
-        camera=Camera(viewmat.float(), K.float(), *lens.size),
+        camera=Camera(image.viewmat().float(), K.float(), *lens.size),
         camera_size=(camera.width, camera.height),
         photograph=photograph,
         lens=lens,

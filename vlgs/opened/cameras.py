@@ -14,9 +14,9 @@ from torch.nn.functional import normalize
 
 from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.lens import make_lens
-from vlgs.data.sparse import read_cameras
+from vlgs.data.sparse import Origin, moved, read_cameras
 from vlgs.data.untrusted.text import read_json
-from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat
+from vlgs.geometry import camera_center, pose_matrix
 from vlgs.opened.files import NamedCamera
 from vlgs.opened.run import OpenedRun
 from vlgs.types import Camera
@@ -44,7 +44,7 @@ def cameras_of(run: OpenedRun, which: str, frames: int = 120) -> CameraPath:
     Args:
         run: Whose scene is seen.
         which: ``train``, ``test``, ``orbit``, the name of a photograph, or a file: a camera path of nerfstudio's viewer, a transforms.json,
-            or a folder of COLMAP's. Files are in the world of the scene's own cameras.
+            or a folder of COLMAP's. Files are in the world of the scene's files, from which `SceneNotes.origin` is subtracted.
         frames: Of an orbit.
 
     Raises:
@@ -72,8 +72,8 @@ def cameras_of(run: OpenedRun, which: str, frames: int = 120) -> CameraPath:
     if path.suffix == ".json" and path.is_file():
         content = read_json(path, "a JSON of cameras")
         if isinstance(content, dict) and "camera_path" in content:
-            return _camera_path(path, content)
-    return CameraPath(_reconstruction(path))
+            return _camera_path(path, content, run.notes.origin)
+    return CameraPath(_reconstruction(path, run.notes.origin))
 
 
 def orbit(cameras: Sequence[Camera], frames: int) -> list[NamedCamera]:
@@ -161,7 +161,7 @@ def _across(axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     return normalize(torch.linalg.cross(axis, other), dim=0)
 
 
-def _camera_path(path: Path, content: Mapping[str, Any]) -> CameraPath:
+def _camera_path(path: Path, content: Mapping[str, Any], origin: Origin) -> CameraPath:
     """nerfstudio's: camera to world with OpenGL axes, and the vertical field of view in degrees."""
     width = _number(path, content, "render_width", 1, LARGEST)
     height = _number(path, content, "render_height", 1, LARGEST)
@@ -183,6 +183,7 @@ def _camera_path(path: Path, content: Mapping[str, Any]) -> CameraPath:
         focal = height / 2 / math.tan(math.radians(fov) / 2)
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         pose = _pose(path, f"camera {index}", entry.get("camera_to_world"))
+        pose[:3, 3] -= torch.tensor(origin, dtype=torch.float64)
         camera = Camera(torch.linalg.inv(pose @ _FLIP).float(), K, int(width), int(height))
         frames.append(NamedCamera(f"path_{index:05d}", "path", camera))
     return CameraPath(frames, fps)
@@ -224,9 +225,9 @@ def _number(
     return value
 
 
-def _reconstruction(path: Path) -> list[NamedCamera]:
+def _reconstruction(path: Path, origin: Origin) -> list[NamedCamera]:
     """Cameras of COLMAP or of a transforms.json, by name, without distortion, as photographs are read."""
-    model = read_cameras(path)
+    model = moved(read_cameras(path), origin)
     file = str(model.file("cameras"))
     lenses = {c.camera_id: make_lens(c, (c.width, c.height), 1.0, file) for c in model.cameras}
     frames = []
@@ -234,10 +235,8 @@ def _reconstruction(path: Path) -> list[NamedCamera]:
     names = _distinct([image.name for image in images])
     for image, name in zip(images, names, strict=True):
         lens = lenses[image.camera_id]
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = quat_to_rotmat(torch.tensor(image.quat, dtype=torch.float64))
-        viewmat[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
-        camera = Camera(viewmat.float(), torch.from_numpy(lens.intrinsics()).float(), *lens.size)
+        K = torch.from_numpy(lens.intrinsics())
+        camera = Camera(image.viewmat().float(), K.float(), *lens.size)
         frames.append(NamedCamera(name, "file", camera))
     if not frames:
         raise ValueError(f"cameras: {path} must have an image, got none")

@@ -5,12 +5,14 @@ Both are safetensors files with a digest, as checkpoints are (`vlgs.training.che
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from vlgs.data.sparse import AT_HOME, Origin
 from vlgs.fields import Field
 from vlgs.fields.saved import MakePart, put_together, take_apart
 from vlgs.files import write_atomically
@@ -49,6 +51,8 @@ class SceneNotes:
     vocabulary: Vocabulary | None
     levels: tuple[int | None, ...]
     """Mask levels, finest first; (None,) where the data have none."""
+    origin: Origin = AT_HOME
+    """Where in the world of the scene's files its coordinates begin."""
 
 
 def write_scene(folder: RunFolder, scene: Scene, levels: Sequence[int | None]) -> None:
@@ -70,6 +74,7 @@ def write_scene(folder: RunFolder, scene: Scene, levels: Sequence[int | None]) -
         "splits": [split for split, _ in named],
         "classes": list(scene.classes),
         "levels": list(levels),
+        "origin": list(scene.origin),
     }
     if scene.vocabulary is not None:
         meta["words"] = list(scene.vocabulary.names)
@@ -148,6 +153,10 @@ def _notes_of(content: Checkpoint) -> SceneNotes:
             raise ValueError(f"{name} must be a list of texts")
     if not _are((int, type(None)), meta["levels"]) or not meta["levels"]:
         raise ValueError("levels must be a list of numbers")
+    origin = meta.get("origin", list(AT_HOME))  # older files say none
+    if not _are((int, float), origin) or len(origin) != 3 or not all(map(isfinite, origin)):
+        raise ValueError("origin must be three finite numbers")
+    x, y, z = map(float, origin)
     vocabulary = None
     if "words" in meta:
         vectors = tensors["vectors"]
@@ -162,6 +171,7 @@ def _notes_of(content: Checkpoint) -> SceneNotes:
         tuple(meta["classes"]),
         vocabulary,
         tuple(meta["levels"]),
+        (x, y, z),
     )
 
 

@@ -12,9 +12,12 @@ from vlgs.data.sparse.model import (
     image_faults,
     model_faults,
 )
+from vlgs.data.sparse.origin import AT_HOME, Origin, moved, origin_of, origin_warnings
 from vlgs.data.sparse.transforms import write_transforms
 
 __all__ = [
+    "AT_HOME",
+    "Origin",
     "SparseCamera",
     "SparseImage",
     "SparseModel",
@@ -22,6 +25,9 @@ __all__ = [
     "find_sparse",
     "image_faults",
     "model_faults",
+    "moved",
+    "origin_of",
+    "origin_warnings",
     "read_cameras",
     "read_sparse",
     "write_transforms",

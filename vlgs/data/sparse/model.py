@@ -8,9 +8,12 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import torch
 from jaxtyping import Float64, UInt8
+from torch import Tensor
 
 from vlgs.data.diagnostics import Fault, listing, warning
+from vlgs.geometry import quat_to_rotmat
 
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -88,6 +91,13 @@ class SparseImage:
     translation: tuple[float, ...]
     observations: int
     """Sparse points that it sees; -1 where the format does not say."""
+
+    def viewmat(self) -> Float64[Tensor, "4 4"]:
+        """World to camera."""
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3] = quat_to_rotmat(torch.tensor(self.quat, dtype=torch.float64))
+        viewmat[:3, 3] = torch.tensor(self.translation, dtype=torch.float64)
+        return viewmat
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.ply import read_vertices
 from vlgs.data.untrusted.text import read_json
 from vlgs.files import write_atomically
-from vlgs.geometry import quat_to_rotmat, rotmat_to_quat
+from vlgs.geometry import rotmat_to_quat
 
 FILE = "transforms.json"
 _POINTS = "sparse_pc.ply"
@@ -104,13 +104,9 @@ def write_transforms(path: Path, model: SparseModel, images: str = "images") -> 
     lenses = {camera.camera_id: _written_lens(path, camera) for camera in model.cameras}
     frames = []
     for image in model.images:
-        viewmat = np.eye(4)
-        quat = torch.tensor(image.quat, dtype=torch.float64)
-        viewmat[:3, :3] = quat_to_rotmat(quat).numpy()
-        viewmat[:3, 3] = image.translation
         frame: dict[str, Any] = {
             "file_path": str(PurePosixPath(images) / image.name),
-            "transform_matrix": (np.linalg.inv(viewmat) @ _FLIP).tolist(),
+            "transform_matrix": (np.linalg.inv(image.viewmat().numpy()) @ _FLIP).tolist(),
         }
         frames.append(frame if len(lenses) == 1 else frame | lenses[image.camera_id])
     content: dict[str, Any] = dict(next(iter(lenses.values()))) if len(lenses) == 1 else {}
