@@ -1,7 +1,7 @@
 """The one place where a configuration becomes typed parts. What is below it, from the first view read to the last score, sees these alone."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,7 +144,9 @@ def construct(config: DictConfig) -> Experiment:
 def _make_parts(config: DictConfig) -> Parts:
     # Initial weights of the fusion come from the global generator; every other draw has one of its own.
     torch.manual_seed(config.seed)
-    return Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+    parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
+    terms = {name: term for name, term in parts.loss.items() if term is not None}
+    return replace(parts, loss=terms)
 
 
 def _method(config: DictConfig) -> Method | None:
@@ -176,6 +178,8 @@ def _refusal(config: DictConfig, demand: Demand) -> str:
         target = str(config[group].get("_target_", "terms of its own"))
         same = (name for name, said in each.items() if said == config[group])
         got = next(same, None) or option(group, target) or target
+        if got in fitting:
+            got += " with other values"
     return f"config: {group} must be {' or '.join(fitting)} with {demand.asker}{why}, got {got}"
 
 

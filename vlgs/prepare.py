@@ -1,8 +1,9 @@
 """Everything that a run does before its first step. `vlgs.run` and `vlgs.check` share it, so that both refuse the same things with the same words."""
 
+import copy
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,10 +12,11 @@ import torch
 
 from vlgs.data.diagnostics import Fault, warning
 from vlgs.experiment import Experiment, Scenes
-from vlgs.formats import file_digest, folder_digest
-from vlgs.heads import FittedHead
+from vlgs.formats import file_digest, folder_digest, load_weights
+from vlgs.heads import FittedHead, Head, Particular
 from vlgs.ops.rasterize import check_config as check_constants
-from vlgs.queries import Particular, TextEncoder, encode_questions, words_of
+from vlgs.queries import Particular as ParticularQuery
+from vlgs.queries import TextEncoder, encode_questions, words_of
 from vlgs.queries.text import VocabularyText
 from vlgs.report.evaluate import evaluate
 from vlgs.runs import RunFolder
@@ -69,12 +71,15 @@ def prepare(experiment: Experiment) -> Prepared:
     experiment.augment.require(scenes)
     if experiment.method is not None:
         experiment.method.require(scenes)
-    read = [ready.fingerprint, experiment.augment.identity()]
-    read += [file_digest(path, key) for key, path in experiment.given_files.items()]
-    read += [folder_digest(path, key) for key, path in experiment.given_folders.items()]
-    content = " ".join(filter(None, read))
+        _require_head(experiment.parts.head, scenes.values())
+    read = {"": " ".join(filter(None, [ready.fingerprint, experiment.augment.identity()]))}
+    read |= {key: file_digest(path, key) for key, path in experiment.given_files.items()}
+    read |= {key: folder_digest(path, key) for key, path in experiment.given_folders.items()}
+    trained = (digest for key, digest in read.items() if not key.startswith("query."))
     return replace(
-        ready, run_id=experiment.run_id(content), trained_id=experiment.trained_id(content)
+        ready,
+        run_id=experiment.run_id(" ".join(read.values())),
+        trained_id=experiment.trained_id(" ".join(trained)),
     )
 
 
@@ -116,7 +121,7 @@ def text_encoder(experiment: Experiment, scene: Scene) -> TextEncoder | None:
         )
         return None
     encode_questions(query, text, scene)
-    if isinstance(query, Particular) and scene.classes:
+    if isinstance(query, ParticularQuery) and scene.classes:
         query.require(scene, scene.classes)
     return text
 
@@ -158,6 +163,16 @@ def rehearse(ready: Prepared) -> None:
         field = run_stages(further, ready.scenes, workshop).field()
     seen = replace(scene, test=scene.test[:1])
     evaluate(field, seen, experiment.query, text, experiment.protocol)
+
+
+def _require_head(head: Head, scenes: Iterable[Scene]) -> None:
+    """Refuse a head before the first stage of a method, which may have no language and take most of the run."""
+    seen = [scene for scene in scenes if len(scene.mask_vectors)]
+    if isinstance(head, Particular):
+        for scene in seen:
+            head.require(scene.mask_vectors)
+    if seen and isinstance(head, FittedHead) and head.weights is not None:
+        load_weights(copy.deepcopy(head), head.weights)
 
 
 def _require_sizes(scene: Scene) -> None:

@@ -19,6 +19,8 @@ from vlgs.runs import RunFolder
 log = logging.getLogger(__name__)
 
 _CHECKPOINTS = "checkpoint"
+_ADDED_MAPS = "augment/language/*.npz"
+"""Language maps of views that ``augment=offline_sam`` adds."""
 
 
 def take_training(folder: RunFolder, trained_id: str) -> dict[str, Any] | None:
@@ -49,6 +51,8 @@ def take_training(folder: RunFolder, trained_id: str) -> dict[str, Any] | None:
 
 def _link(source: Path, folder: RunFolder) -> None:
     """Checkpoints are never written to, so that both runs may have the same file; a log would be."""
+    for maps in sorted(source.glob(_ADDED_MAPS)):
+        _share(maps, folder.path / maps.relative_to(source))
     for checkpoints in sorted(source.rglob(_CHECKPOINTS)):
         part = folder.part(str(checkpoints.parent.relative_to(source)))
         part.checkpoint.mkdir(parents=True)
@@ -56,7 +60,12 @@ def _link(source: Path, folder: RunFolder) -> None:
         if log.is_file():
             write_atomically(part.curves, log.read_bytes())
         for path in checkpoints.glob("*.safetensors"):
-            try:
-                os.link(path, part.checkpoint / path.name)
-            except OSError:  # another file system, or one without links
-                shutil.copy2(path, part.checkpoint / path.name)
+            _share(path, part.checkpoint / path.name)
+
+
+def _share(path: Path, other: Path) -> None:
+    other.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(path, other)
+    except OSError:  # another file system, or one without links
+        shutil.copy2(path, other)

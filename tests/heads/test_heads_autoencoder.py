@@ -254,7 +254,7 @@ def test_bad_calls():
 @pytest.mark.parametrize(
     "options",
     [
-        {"steps": 1}, {"batch": 0}, {"learning_rate": 0.0}, {"area_power": -1.0}, {"code_noise": torch.inf},
+        {"steps": 1}, {"batch": 0}, {"learning_rate": 0.0}, {"area_power": -1.0}, {"area_power": 2.5}, {"code_noise": torch.inf},
         {"min_coverage": 0.0},
     ],
 )  # fmt: skip

@@ -27,6 +27,9 @@ def finished(results: Path, name: str, **metrics: Any) -> RunFolder:
         "training": TRAINING,
         "machine": machine(),
     }
+    maps = folder.part("augment").path / "language"
+    maps.mkdir(parents=True)
+    (maps / "added_0000.npz").write_bytes(b"dear")
     folder.metrics.write_text(json.dumps(said | metrics))
     return folder
 
@@ -42,6 +45,8 @@ def test_every_model_is_there_once_on_the_disk(tmp_path: Path):
         assert one.samefile(other)
         assert mine.part(name).curves.read_text() == "iteration\n9\n"
         assert not mine.part(name).curves.samefile(his.part(name).curves)  # a log is written to
+    maps = "augment/language/added_0000.npz"
+    assert (mine.path / maps).samefile(his.path / maps)
     assert not mine.metrics.exists()
 
 

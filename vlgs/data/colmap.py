@@ -308,6 +308,9 @@ def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
         hasher.update(parts.vocabulary.vectors.numpy().tobytes())
     if isinstance(parts.labels, DenseFolder):
         hasher.update(repr((parts.labels.classes, sorted(parts.labels.position.items()))).encode())
+        kinds = sorted((c, k) for c, k in parts.labels.class_kinds.items() if k != "other")
+        if kinds:
+            hasher.update(repr(kinds).encode())
     elif parts.labels is not None and parts.labels.classes is not None:
         marked = {stem: sorted(image.categories) for stem, image in parts.labels.images.items()}
         hasher.update(repr((parts.labels.classes, sorted(marked.items()))).encode())

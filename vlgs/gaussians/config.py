@@ -176,6 +176,11 @@ class GaussiansConfig:
         }.items():
             require_choice("gaussians", name, getattr(self, name), options)
 
+        if self.init_features == "lifted" and not self.takes_codes:
+            raise ValueError(
+                "gaussians: codes must be none or unit with init_features=lifted, as sparse ones are weights of a codebook's entries, "
+                f"got {self.codes}"
+            )
         further = {name: _attribute(name, extra) for name, extra in self.attributes.items()}
         object.__setattr__(self, "attributes", further)
 
@@ -186,6 +191,11 @@ class GaussiansConfig:
             return ()
         why = "as codes of masks are lifted onto the Gaussians"
         return (Demand("gaussians.init_features=lifted", "head", "untrained", why),)
+
+    @property
+    def takes_codes(self) -> bool:
+        """Whether a code can be given to a Gaussian as it is to be blended."""
+        return self.codes != "sparse"
 
     @property
     def degree(self) -> int:

@@ -55,6 +55,19 @@ def lengths_count(head: Head) -> bool:
 
 
 @runtime_checkable
+class Particular(Protocol):
+    """A head that not every scene's embeddings will do for."""
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """Refuse what `Head.fit` would refuse: now, and not after a stage that has no language.
+
+        Raises:
+            ValueError: If the embeddings are of another width than was announced.
+        """
+        ...
+
+
+@runtime_checkable
 class FittedHead(Head, Protocol):
     """A head whose fit takes steps, or is read from a file that another program wrote."""
 

@@ -54,7 +54,8 @@ class AutoencoderTraining:
     def __post_init__(self) -> None:
         require_range("autoencoder", 2, 10**7, steps=self.steps)
         require_range("autoencoder", 2, 2**20, batch=self.batch)
-        require_range("autoencoder", 0, 10, area_power=self.area_power, code_noise=self.code_noise)
+        require_range("autoencoder", 0, 10, code_noise=self.code_noise)
+        require_range("autoencoder", 0, 2, area_power=self.area_power)
         require_range("autoencoder", 0, 2**63 - 1, seed=self.seed)
         if not 0.0 < self.learning_rate <= 1.0:
             raise ValueError(

@@ -57,9 +57,13 @@ class Codebook(nn.Module):
         Raises:
             ValueError: If they have another width than was announced.
         """
-        require_width("codebook head", vectors, self.entries.shape[1])
+        self.require(vectors)
         with torch.no_grad():
             self.entries.copy_(clusters(vectors, self.dim, self.seed))
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """See `vlgs.heads.Particular`."""
+        require_width("codebook head", vectors, self.entries.shape[1])
 
     def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m e"]:
         """The embeddings as they are."""

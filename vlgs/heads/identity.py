@@ -34,6 +34,10 @@ class Identity(nn.Module):
         Raises:
             ValueError: If they have another one.
         """
+        self.require(vectors)
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """See `vlgs.heads.Particular`."""
         if vectors.shape[1] != self.dim:
             raise ValueError(
                 f"identity head: dim must be the embedding width {vectors.shape[1]}, got {self.dim}"

@@ -44,6 +44,10 @@ class Linear(nn.Module):
         Raises:
             ValueError: If they have another one.
         """
+        self.require(vectors)
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """See `vlgs.heads.Particular`."""
         if vectors.shape[1] != self.map.out_features:
             raise ValueError(
                 f"linear head: width must be the embedding width {vectors.shape[1]}, got {self.map.out_features}"

@@ -1,6 +1,6 @@
 """GOI's head: a rendered code is classified, and its class is a row of a table of embeddings (Qu et al., ACM MM 2024)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from vlgs.demands import Demand
 from vlgs.heads.clusters import clusters
 from vlgs.heads.codebook import require_width
 from vlgs.heads.folded import Folded, fold_rows
@@ -39,6 +40,9 @@ class LookupTable(nn.Module):
         (torch.Size([5, 4]), torch.Size([5, 8]))
     """
 
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand("head=lookup", "loss", "trains_table", "as its scores of rows are no embeddings"),
+    )
     has_table: ClassVar[bool] = True
     """What its loss asks of it (`vlgs.demands`)."""
 
@@ -68,9 +72,13 @@ class LookupTable(nn.Module):
         Raises:
             ValueError: If they have another width than was announced.
         """
-        require_width("lookup head", vectors, self.table.shape[1])
+        self.require(vectors)
         with torch.no_grad():
             self.table.copy_(clusters(vectors, len(self.table), self.seed))
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """See `vlgs.heads.Particular`."""
+        require_width("lookup head", vectors, self.table.shape[1])
 
     def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m e"]:
         """The embeddings as they are."""

@@ -79,10 +79,7 @@ class Principal(nn.Module):
             raise ValueError(
                 f"principal head: vectors must be finite and at least 1, got {len(vectors)}"
             )
-        if vectors.shape[1] < self.dim:
-            raise ValueError(
-                f"principal head: dim must be at most the embedding width {vectors.shape[1]}, got {self.dim}"
-            )
+        self.require(vectors)
         with one_thread():
             rows = vectors.detach().double()
             rows = rows * areas.double().clamp_min(1)[:, None] ** (self.area_power / 2)
@@ -94,6 +91,13 @@ class Principal(nn.Module):
             self.basis = basis.to(vectors.dtype).contiguous()
             if self.entries:
                 self.centers = clusters(self.targets(vectors), self.entries, self.seed)
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """See `vlgs.heads.Particular`."""
+        if vectors.shape[1] < self.dim:
+            raise ValueError(
+                f"principal head: dim must be at most the embedding width {vectors.shape[1]}, got {self.dim}"
+            )
 
     def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m d"]:
         """Coordinates; shorter than 1 by what the directions leave out."""

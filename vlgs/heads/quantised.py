@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize, one_hot
 
+from vlgs.demands import Demand
 from vlgs.heads.codebook import require_width
 from vlgs.heads.folded import Folded, fold_linear
 from vlgs.heads.rows import layers
@@ -65,6 +66,11 @@ class QuantisedCodes(nn.Module):
         tensor([1., 1., 1., 1., 1., 1., 1., 1.])
     """
 
+    demands: ClassVar[Sequence[Demand]] = (
+        Demand(
+            "head=quantised", "loss", "trains_classes", "as its scores of entries are no embeddings"
+        ),
+    )
     has_classes: ClassVar[bool] = True
     """What its loss asks of it (`vlgs.demands`)."""
     codebook: Tensor
@@ -98,8 +104,12 @@ class QuantisedCodes(nn.Module):
         Raises:
             ValueError: If they have another width than was announced, or areas are negative or all zero.
         """
-        require_width("quantised head", vectors, self.codebook.shape[1])
+        self.require(vectors)
         self.codebook = quantise([vectors], [1.0], areas, len(self.codebook), self.fit_settings)[0]
+
+    def require(self, vectors: Float[Tensor, "m e"]) -> None:
+        """See `vlgs.heads.Particular`."""
+        require_width("quantised head", vectors, self.codebook.shape[1])
 
     def targets(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m k"]:
         """One for the nearest entry, zero for all others."""

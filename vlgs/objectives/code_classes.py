@@ -30,6 +30,8 @@ class CodeClasses(Objective):
         ValueError: If the weight is negative.
     """
 
+    trains_classes: ClassVar[bool] = True
+    """What its head asks of a loss."""
     demands: ClassVar[Sequence[Demand]] = (
         Demand("loss.classes", "head", "has_classes", "as it looks at the classes of codes"),
     )

@@ -45,6 +45,8 @@ class LookupLanguage(Objective):
     demands: ClassVar[Sequence[Demand]] = (
         Demand("loss.lookup", "head", "has_table", "as it learns the rows of a table"),
     )
+    trains_table: ClassVar[bool] = True
+    """What its head asks of a loss."""
     needs = frozenset({"feature"})
 
     def __init__(

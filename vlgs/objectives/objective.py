@@ -63,6 +63,12 @@ class Objective(ABC):
     needs: frozenset[str] = frozenset()
     """What is rendered of the real views for it: ``color``, ``feature``, names of further attributes. A view without language has no
     ``feature``."""
+
+    @property
+    def teaches_codes(self) -> bool:
+        """Whether it has something to say where colour is not trained; what stages of language alone ask of a loss."""
+        return "feature" in self.needs and "color" not in self.needs
+
     rate: float = 0.0
     """Adam's, for the parameters of an objective that is a `torch.nn.Module`."""
 

@@ -98,11 +98,14 @@ class Offline:
         return "" if self.extractor is None else repr(sorted(self.extractor.identity().items()))
 
     def require(self, scenes: Mapping[int | None, Scene]) -> None:
-        """Do nothing if language maps of further views can be made.
+        """Do nothing if further views and their language maps can be made.
 
         Raises:
-            ValueError: If only an extractor can, and there is none, or the mask level is not known.
+            ValueError: If no two views have one size, only an extractor can, and there is none, or the mask level is not known.
         """
+        cameras = [view.camera for view in next(iter(scenes.values())).train]
+        if not any(self._near(cameras)):
+            raise ValueError("augment: two training views must have one image size, got none")
         for level, scene in scenes.items():
             if len(scene.mask_vectors) == 0:
                 continue
@@ -136,13 +139,14 @@ class Offline:
             extended[level] = _with_views(scene, views, maps)
         return extended
 
+    def _near(self, cameras: Sequence[Camera]) -> Sequence[Sequence[int]]:
+        return nearest_views(cameras, self.neighbours if self.pairs == "neighbours" else None)
+
     @torch.no_grad()
     def _render(self, scene: Scene, model: SplatModel, seed: int) -> list[AddedView]:
         cameras = [view.camera for view in scene.train]
-        near = nearest_views(cameras, self.neighbours if self.pairs == "neighbours" else None)
+        near = self._near(cameras)
         with_others = [index for index, others in enumerate(near) if others]
-        if not with_others:
-            raise ValueError("augment: two training views must have one image size, got none")
         rng, between, fused = np.random.default_rng([seed, _CAMERAS]), UniformBlend(), model.fuse()
         views = []
         for number in range(self.views):

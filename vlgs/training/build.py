@@ -131,6 +131,9 @@ def build_module(
     )
     color = color or (start is not None and not has(fusion, "untrained"))
     objectives = {n: o for n, o in parts.loss.items() if color or "color" not in o.needs}
+    if not any(language or o.needs != {"feature"} for o in objectives.values()):
+        why = "" if language else ", as the scene has no language"
+        raise ValueError(f"loss: there must be a term of what is trained{why}, got none")
     setup = bind(
         objectives, scene, model, parts.blend, parts.trainer.skip, seed, parts.trainer.iterations
     )

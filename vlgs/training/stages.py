@@ -28,6 +28,8 @@ from vlgs.values import require_range
 _TAKEN = ("augment", "checkpoint", "renders")
 """Folders of a run that are no stage's of a method."""
 
+_NO_CODES = "as codes=sparse keeps weights of a codebook's entries"
+
 SHARES = (1e-4, 100)
 """Least and most iterations of a stage, in those of ``trainer``."""
 
@@ -217,10 +219,15 @@ class Train:
 
     @property
     def demands(self) -> Sequence[Demand]:
-        """That nobody expects an indicator to be learned where it is frozen at its first value."""
-        frozen = "indicator_logits" in self.freeze
-        asker, why = "a stage that freezes indicator_logits", "as nothing trains it"
-        return (Demand(asker, "indicator", "untrained", why),) if frozen else ()
+        """That nobody expects an indicator to be learned where it is frozen at its first value, or codes to be without a loss."""
+        asked = []
+        if "indicator_logits" in self.freeze:
+            asker, why = "a stage that freezes indicator_logits", "as nothing trains it"
+            asked.append(Demand(asker, "indicator", "untrained", why))
+        if not self.color:
+            asker, why = "a stage without colour", "as it trains language alone"
+            asked.append(Demand(asker, "loss", "teaches_codes", why))
+        return asked
 
     def run(self, progress: Progress, workshop: Workshop) -> Progress:
         """See `Stage`. Without masks, and without colour to train, the model stays as it starts."""
@@ -280,9 +287,12 @@ class TrainColor:
 class Lift:
     """Gives every Gaussian of an earlier stage a code of the masked pixels that it is blended into; nothing is trained."""
 
-    demands: ClassVar[Sequence[Demand]] = tuple(
-        Demand("language that is lifted", group, "untrained", "as nothing trains it")
-        for group in ("fusion", "indicator", "head")
+    demands: ClassVar[Sequence[Demand]] = (
+        *(
+            Demand("language that is lifted", group, "untrained", "as nothing trains it")
+            for group in ("fusion", "indicator", "head")
+        ),
+        Demand("language that is lifted", "gaussians", "takes_codes", _NO_CODES),
     )
     start: str
     """The earlier stage."""
