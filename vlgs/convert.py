@@ -3,9 +3,10 @@
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from vlgs.data.sparse import find_sparse, read_cameras, write_transforms
+from vlgs.data.sparse import AT_HOME, find_sparse, read_cameras, subtracted, write_transforms
 from vlgs.data.sparse.model import SparseModel
 from vlgs.data.sparse.write import write_colmap
 from vlgs.formats import (
@@ -75,16 +76,28 @@ def convert(
     if source.resolve() == target.resolve():
         raise ValueError(f"convert: OUT must be another path than IN, got {target}")
     if head is not None:
+        _require_unused("language maps", name, drop)
         count = compress_language(source, target, read_autoencoder(head))
         return [f"{target}: language codes of {count} views"]
     if _is_run(source):
-        source, lines = _point_cloud_of(source)
-        return lines + _convert_gaussians(source, target, name, drop)
+        cloud, lines = _point_cloud_of(source)
+        moved = _moved(source)
+        return lines + _convert_gaussians(cloud, target, name, drop) + moved
     if source.is_dir() or source.suffix == ".json":
-        return _convert_cameras(source, target, name)
+        return _convert_cameras(source, target, name, drop)
     if source.suffix == ".safetensors" or target.suffix == ".safetensors":
+        _require_unused("an autoencoder", name, drop)
         return _convert_autoencoder(source, target)
     return _convert_gaussians(source, target, name, drop)
+
+
+def _require_unused(what: str, name: str | None, drop: bool, names: Sequence[str] = ()) -> None:
+    """Refuse options that mean nothing for what is written; `names` are the formats that there are of it."""
+    if drop:
+        raise ValueError(f"convert: --drop must go with Gaussians, got {what}")
+    if name is not None and name not in names:
+        expected = f"be {' or '.join(names)}" if names else "not be given"
+        raise ValueError(f"convert: --as must {expected} for {what}, got {name}")
 
 
 def _is_run(source: Path) -> bool:
@@ -104,6 +117,15 @@ def _point_cloud_of(folder: Path) -> tuple[Path, list[str]]:
     others = ", ".join(str(path.relative_to(folder)) for path in found if path != chosen)
     says = f"from {chosen.relative_to(folder)}; the run also has {others}"
     return chosen, [says] if others else []
+
+
+def _moved(folder: Path) -> list[str]:
+    """That positions of a run are not those of its scene's files, where they are not."""
+    from vlgs.opened.files import read_scene
+
+    run = RunFolder(folder)
+    origin = read_scene(run).origin if run.scene.is_file() else AT_HOME  # version 0.1 wrote none
+    return [] if origin == AT_HOME else [f"beware: {subtracted(origin)}"]
 
 
 def _convert_gaussians(source: Path, target: Path, name: str | None, drop: bool) -> list[str]:
@@ -144,18 +166,21 @@ def _convert_autoencoder(source: Path, target: Path) -> list[str]:
     return [f"{target}: autoencoder {head.mean.shape[0]} -> {head.dim}"]
 
 
-def _convert_cameras(source: Path, target: Path, name: str | None) -> list[str]:
+def _convert_cameras(source: Path, target: Path, name: str | None, drop: bool) -> list[str]:
     model = read_cameras(source)
     beware = []
     if target.suffix == ".json":
+        _require_unused("cameras in a .json", name, drop)
         images = _images_of(source, model)
         if images is None:
             beware = ["beware: no photographs found; their paths are images/NAME, beside the file"]
         beside = "images" if images is None else os.path.relpath(images, target.parent.resolve())
         write_transforms(target, model, Path(beside).as_posix())
-    elif name not in (None, *_COLMAP):
-        raise ValueError(f"convert: cameras go to {' or '.join(_COLMAP)}, got --as {name}")
     else:
+        _require_unused("cameras", name, drop, _COLMAP)
+        if target.suffix.lower() in {suffix for suffix, _ in FORMATS.values()}:
+            what = "must be a .json or a folder for cameras"
+            raise ValueError(f"convert: OUT {what}, got {target.name}, a file of Gaussians")
         write_colmap(target, model, text=name == "colmap-text")
     return [f"{target}: {len(model.images)} images, {len(model.points)} points", *beware]
 

@@ -247,3 +247,59 @@ def test_a_folder_of_neither_kind_says_what_it_should_hold(tmp_path: Path):
     assert "labels must be <stem>.json files (LERF-OVS), or classes.json and <stem>.png" in str(
         fault
     )
+
+
+def cut_out(mask: np.ndarray) -> Image.Image:
+    """White everywhere, and transparent around a mask."""
+    pixels = np.full((*mask.shape, 4), 255, np.uint8)
+    pixels[..., 3] = np.where(mask, 255, 0)
+    return Image.fromarray(pixels)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".PNG"])
+@pytest.mark.parametrize("layout", ["3D-OVS", "GOI"])
+def test_masks_end_where_they_are_transparent(tmp_path: Path, layout: str, suffix: str):
+    mask = np.zeros((10, 20), bool)
+    mask[2:8, 3:9] = True
+    path = tmp_path / ("a/cup" if layout == "3D-OVS" else "cup/masks/a")
+    path.parent.mkdir(parents=True)
+    cut_out(mask).save(path.with_suffix(suffix))
+    if layout == "3D-OVS":
+        (tmp_path / "classes.txt").write_text("cup\n")
+    folder, faults = open_labels(tmp_path)
+    assert isinstance(folder, ObjectFolder)
+    assert not faults
+    np.testing.assert_array_equal(folder.images["a"].mask("cup"), mask)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "LA", "RGB", "RGBA"])
+def test_opaque_masks_mean_all_that_is_not_black(tmp_path: Path, mode: str):
+    mask = np.eye(10, 20, dtype=bool)
+    (tmp_path / "classes.txt").write_text("cup\n")
+    (tmp_path / "a").mkdir()
+    Image.fromarray(mask.astype(np.uint8) * 255).convert(mode).save(tmp_path / "a" / "cup.png")
+    folder, _ = open_labels(tmp_path)
+    assert isinstance(folder, ObjectFolder)
+    np.testing.assert_array_equal(folder.images["a"].mask("cup"), mask)
+
+
+def test_label_images_may_end_in_capitals_and_must_be_there(tmp_path: Path):
+    write_dense(tmp_path, np.array([[0, 2, 4]], np.uint8))
+    (tmp_path / "a.png").rename(tmp_path / "a.PNG")
+    folder, faults = open_labels(tmp_path)
+    assert isinstance(folder, DenseFolder)
+    assert not faults
+    assert folder.read_ids("a").tolist() == [[0, 1, 2]]
+    (tmp_path / "a.PNG").unlink()
+    _, (fault,) = open_labels(tmp_path)
+    assert fault.severity == "error"
+    assert str(fault) == f"{tmp_path}: label images must be at least 1, got 0; name them <stem>.png"
+
+
+def test_a_key_that_comes_twice_is_refused(tmp_path: Path):
+    write_dense(tmp_path, np.array([[3, 5]], np.uint8))
+    listed = '{"3": {"name": "glass"}, "3": {"name": "vase"}, "5": {"name": "wall"}}'
+    (tmp_path / "classes.json").write_text(f'{{"classes": {listed}}}')
+    folder, (fault,) = open_labels(tmp_path)
+    assert folder is None
+    assert str(fault).endswith("classes.json: content must have every key once, got '3' 2 times")

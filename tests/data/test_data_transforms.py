@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from colmap_scenes import HEIGHT, WIDTH, picture, write_scene
+from colmap_scenes import HEIGHT, WIDTH, picture, surveyed, write_model, write_scene
 from PIL import Image
+from plyfile import PlyData, PlyElement
 from tiny_runs import composed
 
 from vlgs.check import check
@@ -65,6 +66,25 @@ def test_transforms_become_colmap(tmp_path: Path, name: str):
     assert (tmp_path / "b" / "sparse" / "0" / f"images.{suffix}").is_file()
     assert read_cameras(tmp_path / "b" / "sparse" / "0").suffix == f".{suffix}"
     assert_same(load_scene(str(tmp_path / "b")), want)
+
+
+def test_points_in_the_coordinates_of_a_map_stay_where_they_are(tmp_path: Path):
+    write_scene(tmp_path / "near")
+    surveyed(tmp_path / "far")
+    for name, kind, atol in (("near", b"property float x", 1e-6), ("far", b"property double x", 0)):
+        want = read_cameras(tmp_path / name).points
+        convert(tmp_path / name, tmp_path / name / "cameras.json")
+        assert kind in (tmp_path / name / "sparse_pc.ply").read_bytes()
+        got = read_cameras(tmp_path / name / "cameras.json").points
+        np.testing.assert_allclose(got, want, rtol=0, atol=atol)
+
+
+def test_a_camera_without_a_place_in_the_format_is_named(tmp_path: Path):
+    lens = ("EQUIRECTANGULAR", (24.0, 12.0))
+    write_model(tmp_path / "sparse" / "0", ["a.png"], lens, (24, 12), text=True)
+    with pytest.raises(ValueError, match=r"cameras must be perspective .* got EQUIRECTANGULAR"):
+        convert(tmp_path, tmp_path / "cameras.json")
+    assert not (tmp_path / "cameras.json").exists()
 
 
 def frame(**keys: Any) -> dict[str, Any]:
@@ -152,6 +172,62 @@ def test_faults_are_named(tmp_path: Path, keys: dict[str, Any], message: str):
         read_cameras(path)
 
 
+def colored(folder: Path, kind: str, *rows: tuple[float, ...], text: bool = False) -> Path:
+    """A file of a scene whose points have colours of a NumPy type."""
+    columns = [(axis, "<f4") for axis in "xyz"] + [(c, kind) for c in ("red", "green", "blue")]
+    points = np.array([(0, 0, 0, *row) for row in rows], columns)
+    path = written(folder, frame(), **LENS, ply_file_path="points.ply")
+    PlyData([PlyElement.describe(points, "vertex")], text, "<").write(str(folder / "points.ply"))
+    return path
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "red", "want"),
+    [
+        ("u1", 204, 204),
+        ("u1", 0, 0),
+        ("f4", 0.8, 204),
+        ("f8", 1.0000001, 255),
+        ("f4", 203.6, 204),
+        ("f4", np.nan, 0),
+        ("u2", 204, 204),
+        ("i4", 204, 204),
+    ],
+)
+def test_colours_mean_what_their_file_says(
+    tmp_path: Path, kind: str, red: float, want: int, text: bool
+):
+    path = colored(tmp_path, kind, (0, 0, 0), (red, 0, 0), text=text)
+    assert read_cameras(path).point_colors.tolist() == [[0, 0, 0], [want, 0, 0]]
+
+
+@pytest.mark.parametrize("kind", ["<u2", ">u2"])
+def test_colours_of_sixteen_bits(tmp_path: Path, kind: str):
+    path = colored(tmp_path, kind, (52_428, 100, 65_535))
+    assert read_cameras(path).point_colors.tolist() == [[204, 0, 255]]
+    # The reader of text does not say what type a column has.
+    text = colored(tmp_path, kind, (52_428, 100, 65_535), text=True)
+    with pytest.raises(SceneError, match="as ushort of a binary file, got 0 to 65535"):
+        read_cameras(text)
+
+
+@pytest.mark.parametrize(
+    ("kind", "red", "got"),
+    [
+        ("f4", 300.0, "0 to 300"),
+        ("f4", -0.5, "-0.5 to 1"),
+        ("f8", np.inf, "0 to inf"),
+        ("i2", -1, "-1 to 1"),
+        ("i4", 256, "0 to 256"),
+    ],
+)
+def test_what_is_no_colour_is_refused(tmp_path: Path, kind: str, red: float, got: str):
+    path = colored(tmp_path, kind, (red, 1, 0))
+    with pytest.raises(SceneError, match=rf"points\.ply: colours must be 0 to 255, .* got {got}"):
+        read_cameras(path)
+
+
 def test_as_a_data_source(tmp_path: Path):
     moved(tmp_path / "a", tmp_path / "b", "OPENCV")
     config = composed("data=nerfstudio", f"data.root={tmp_path / 'b'}").data
@@ -184,6 +260,23 @@ def test_llff_poses_are_the_scene(tmp_path: Path):
         SceneError, match=r"finite floats \[9, 17\], a row for each image, got .*\[8, 17\]"
     ):
         load_scene(str(tmp_path))
+
+
+AXES = {"sheared": [[0.3, 1, 0], [-1, 0, 0.4], [0, 0, 1]], "long": [[0, 3, 0], [-3, 0, 0], [0, 0, 3]],
+        "mirrored": [[0, 1, 0], [1, 0, 0], [0, 0, 1]], "beyond": [[0, 1e300, 0], [1e300, 0, 0], [0, 0, 1]]}  # fmt: skip
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_llff_axes_that_are_no_rotation_are_named(tmp_path: Path, axes: str):
+    (tmp_path / "images").mkdir()
+    rows = []
+    for i, turn in enumerate(([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], AXES[axes])):
+        Image.fromarray(picture(i)).save(tmp_path / "images" / f"{i}.png")
+        matrix = np.column_stack([np.array(turn, float), [i, 0, 0], [HEIGHT, WIDTH, 20.0]])
+        rows.append([*matrix.ravel(), 0.1, 10.0])
+    np.save(tmp_path / "poses_bounds.npy", np.array(rows))
+    with pytest.raises(SceneError, match="row 1: axes must be down, right and back, of length 1"):
+        read_cameras(tmp_path)
 
 
 def test_photographs_of_half_the_size_that_a_distorted_lens_is_written_for(tmp_path: Path):

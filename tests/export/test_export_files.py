@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -83,6 +84,16 @@ def test_an_unfinished_run_shows_its_last_checkpoint(
     main([str(tmp_path / "run"), str(tmp_path / "a.html"), "--words", "mug"])
     assert "not finished, shown as of step 9" in capsys.readouterr().err
     assert "Training goes on: this is step 9." in (tmp_path / "a.html").read_text()
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_gaussians_say_what_was_subtracted(opened: OpenedRun, tmp_path: Path, far: bool):
+    origin = (500_123.0, 5_412_345.5, 312.0) if far else (0.0, 0.0, 0.0)
+    run = replace(opened, notes=replace(opened.notes, origin=origin))
+    said = {name: export(run, tmp_path / name, Wanted()) for name in ("a.ply", "a.html")}
+    line = "(500123, 5412345.5, 312) is subtracted from all positions"
+    assert (line in said["a.ply"]) == far
+    assert not any("subtracted" in one for one in said["a.html"]), "a page shows no coordinates"
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_models import save_siglip
+from safetensors.torch import load_file, save_file
+from tiny_models import save_clip, save_sam, save_siglip
 
 from vlgs.features.encoders import DenseMaps, ImageEncoder, square_crop
 from vlgs.features.masks import Mask
@@ -145,6 +146,25 @@ def test_weights_that_are_no_model_are_refused(tmp_path: Path):
     encoder = ImageEncoder(Pretrained(name="lab/model", weights=str(tmp_path)))
     with pytest.raises(ValueError, match="files must be a whole model of lab/model"):
         encoder(noise(), [Mask(0, 0, np.ones((1, 1), bool))], "a")
+
+
+@pytest.mark.parametrize(
+    ("model", "part"),
+    [("clip", "vision_model"), ("clip", "text_projection"), ("sam", "mask_decoder")],
+)
+def test_weights_that_lack_a_part_are_refused(tmp_path: Path, model: str, part: str):
+    pytest.importorskip("transformers")
+    from transformers import AutoModel, SamModel
+
+    {"clip": save_clip, "sam": save_sam}[model](tmp_path / model)
+    pretrained = Pretrained(name=f"lab/{model}", weights=str(tmp_path))
+    kind = {"clip": AutoModel, "sam": SamModel}[model]
+    pretrained.load(kind)  # weights that are tied or computed are in no file
+    file = tmp_path / model / "model.safetensors"
+    held = {name: rows for name, rows in load_file(file).items() if not name.startswith(part)}
+    save_file(held, file, metadata={"format": "pt"})
+    with pytest.raises(ValueError, match=rf"a whole model of lab/{model}, got no weights {part}"):
+        pretrained.load(kind)
 
 
 def test_a_missing_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -158,9 +159,28 @@ def test_a_folder_of_other_settings_is_refused(scene: Path, weights: Path):
     assert find_mask_files(scene / "language_features", "frame_00000") is not None
 
 
-def test_other_weights_are_other_settings(scene: Path, weights: Path, tmp_path: Path):
-    import shutil
+def test_a_complete_folder_of_other_settings_is_refused(scene: Path, weights: Path, tmp_path: Path):
+    extract(config(scene, weights, *QUICK))
+    first = maps_of(scene)
+    extract(config(scene, weights, *QUICK))  # nothing is left to do
+    changed = (*QUICK, "features.extractor.segmenter.rounds=3")
+    for place in (weights, tmp_path):  # the latter has none
+        with pytest.raises(ValueError, match=r"extractor\.segmenter\.rounds was 10, is 3"):
+            extract(config(scene, place, *changed))
+        with pytest.raises(ValueError, match=r"extractor\.segmenter\.rounds was 10, is 3"):
+            list(job.estimate(job.plan(config(scene, place, *changed))))
+    extract(config(scene, tmp_path, *QUICK))
+    other = shutil.copytree(weights, tmp_path / "other")
+    path = other / "CLIP-ViT-B-16-laion2B-s34B-b88K" / "config.json"
+    path.write_text(path.read_text() + " ")
+    with pytest.raises(ValueError, match=r"settings must be those .* read\.encoder was"):
+        extract(config(scene, other, *QUICK))
+    (scene / "language_features" / "features.json").unlink()  # as of another program
+    extract(config(scene, weights, *changed))
+    assert maps_of(scene) == first
 
+
+def test_other_weights_are_other_settings(scene: Path, weights: Path, tmp_path: Path):
     extract(config(scene, weights, *QUICK))
     (scene / "language_features" / "frame_00001_s.npy").unlink()
     other = shutil.copytree(weights, tmp_path / "other")

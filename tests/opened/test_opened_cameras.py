@@ -114,13 +114,24 @@ def test_cameras_of_colmap_and_of_transforms(tmp_path: Path, opened: OpenedRun):
     model = SparseModel(tmp_path, "made", (camera,), images, np.array([1]), points, colors)
     write_colmap(tmp_path / "model", model)
     write_transforms(tmp_path / "transforms.json", model)
-    for source in (tmp_path / "model", tmp_path / "transforms.json"):
-        frames = cameras_of(opened, str(source)).frames
-        assert [frame.name for frame in frames] == ["a", "b"]
+    for source, names in (("model", ["a", "b"]), ("transforms.json", ["b", "a"])):
+        frames = cameras_of(opened, str(tmp_path / source)).frames
+        assert [frame.name for frame in frames] == names
         got = frames[0].camera
         torch.testing.assert_close(camera_center(got.viewmat), torch.tensor([1.0, 2.0, 3.0]))
         assert got.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == [40.0, 41.0, 23.0, 19.0]
         assert (got.width, got.height) == (48, 36)
+
+
+def test_frames_of_a_transforms_json_come_in_its_order(tmp_path: Path, opened: OpenedRun):
+    """A path that is to be a video; by name 10 would come after 1."""
+    poses = [[[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for i in range(12)]
+    frames = [{"file_path": f"{i}.png", "transform_matrix": pose} for i, pose in enumerate(poses)]
+    (tmp_path / "path.json").write_text(
+        json.dumps({"fl_x": 20, "w": 24, "h": 18, "frames": frames})
+    )
+    found = cameras_of(opened, str(tmp_path / "path.json")).frames
+    assert [frame.name for frame in found] == [str(i) for i in range(12)]
 
 
 def test_images_of_one_stem_keep_apart(opened: OpenedRun, tmp_path: Path):

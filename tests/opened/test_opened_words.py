@@ -6,7 +6,8 @@ import pytest
 import torch
 from tiny_models import save_clip
 
-from vlgs.opened.word_cache import CachedText, cache_folder
+from vlgs.data.language import write_vocabulary
+from vlgs.opened.word_cache import CachedText, _weights_of, cache_folder
 from vlgs.opened.words import Words
 from vlgs.queries.text import ClipText
 from vlgs.types import Vocabulary
@@ -45,6 +46,35 @@ def test_weights_and_template_are_part_of_the_key(tower: ClipText, tmp_path: Pat
     assert not torch.equal(CachedText(other).encode(["mug"]), plain)
     with pytest.raises(ValueError, match=r"template must contain {} once"):
         CachedText(tower, "a mug")
+
+
+def test_every_file_of_the_model_is_part_of_the_key(tower: ClipText, tmp_path: Path):
+    folder = tmp_path / "clip"
+    first = CachedText(tower).encode(["mug"])
+    file = folder / "tokenizer.json"  # other tokens for the same letters
+    file.write_text(file.read_text().replace('"m"', '"?"').replace('"b"', '"m"'))
+    changed = ClipText(model=str(folder))
+    second = CachedText(changed).encode(["mug"])
+    assert not torch.equal(second, first)
+    assert torch.equal(second, changed.encode(["mug"]))
+    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+    before = _weights_of(str(folder))
+    (folder / "pytorch_model.bin").write_bytes(b"others")
+    assert _weights_of(str(folder)) != before
+
+
+@pytest.mark.parametrize("table", ["own", "further"])
+def test_a_word_that_is_kept_must_be_as_wide_as_the_run(
+    tower: ClipText, tmp_path: Path, table: str
+):
+    assert CachedText(tower).encode(["mug"]).shape == (1, 12)
+    wide = Vocabulary(("cup",), torch.eye(1, 64))
+    write_vocabulary(tmp_path / "wide.npz", wide)
+    own, further = (wide, None) if table == "own" else (None, tmp_path / "wide.npz")
+    words = Words.of(own, {}, further, tower.model, "{}")
+    for names in (["mug"], ["cup", "mug"], ["mug", "bear"]):
+        with pytest.raises(ValueError, match=r"as wide as the scene's vocabulary \(64\), got 12"):
+            words.encode(names)
 
 
 def test_a_damaged_cache_is_made_anew(tower: ClipText):

@@ -127,6 +127,22 @@ def test_masks_of_a_user_are_read_at_the_size_of_the_view(tmp_path: Path, tiny_s
     assert folder.find(field, tiny_scene, "mug", vector) is None
 
 
+@pytest.mark.parametrize("suffix", [".png", ".PNG"])
+def test_masks_of_a_user_end_where_they_are_transparent(
+    tmp_path: Path, tiny_scene: Scene, suffix: str
+):
+    view = tiny_scene.train[1]
+    pixels = np.full((view.camera.height, view.camera.width, 4), 255, np.uint8)
+    pixels[..., 3] = 0
+    pixels[3:6, 4:9, 3] = 255
+    (tmp_path / "mug").mkdir()
+    Image.fromarray(pixels).save(tmp_path / "mug" / f"{view.name}{suffix}")
+    vector = tiny_scene.mask_vectors[0]
+    found = MaskFolder(str(tmp_path)).find(grouping(tiny_scene), tiny_scene, "mug", vector)
+    assert found is not None
+    assert torch.equal(found[1], torch.from_numpy(pixels[..., 3] > 0))
+
+
 def test_masks_that_teach_nothing_are_refused(
     tmp_path: Path, tiny_scene: Scene, caplog: pytest.LogCaptureFixture
 ):

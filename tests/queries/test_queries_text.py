@@ -1,9 +1,12 @@
 """Words to vectors: tables with helpful errors, and CLIP's text tower on tiny random weights without a network."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from tiny_models import save_clip, save_siglip
 
 from vlgs.queries import LerfRelevancy, TextEncoder, VocabSoftmax, encode_prompts
@@ -137,6 +140,83 @@ def test_missing_weights_are_explained(tmp_path: Path):
     encoder = ClipText(model=str(tmp_path / "nothing"))  # loads nothing before it is asked
     with pytest.raises(FileNotFoundError, match=r"text\.model=<folder"):
         encoder.encode(["apple"])
+
+
+@pytest.mark.parametrize("kept", [(), ("vocab.json",), ("tokenizer_config.json",)])
+def test_a_folder_without_a_tokenizer_is_refused(tmp_path: Path, kept: tuple[str, ...]):
+    save_clip(tmp_path)
+    for name in {"tokenizer.json", "tokenizer_config.json"} - set(kept):
+        (tmp_path / name).unlink()
+    if "vocab.json" in kept:  # without merges.txt
+        (tmp_path / "vocab.json").write_text("{}")
+    with pytest.raises(FileNotFoundError, match=r"got no tokenizer\.json;") as e:
+        ClipText(model=str(tmp_path)).encode(["mug", "bear"])
+    assert str(e.value).startswith(f"text: {tmp_path} must hold config.json")
+
+
+def test_a_tokenizer_of_two_files_will_do(tmp_path: Path):
+    save_clip(tmp_path)
+    want = ClipText(model=str(tmp_path)).encode(["mug", "bear"])
+    file = tmp_path / "tokenizer.json"
+    vocabulary = json.loads(file.read_text())["model"]["vocab"]
+    (tmp_path / "vocab.json").write_text(json.dumps(vocabulary))
+    (tmp_path / "merges.txt").write_text("#version: 0.2\n")
+    file.unlink()
+    torch.testing.assert_close(ClipText(model=str(tmp_path)).encode(["mug", "bear"]), want)
+
+
+def test_weights_that_lack_a_tower_are_refused(tmp_path: Path):
+    save_clip(tmp_path)
+    file = tmp_path / "model.safetensors"
+    whole = load_file(file)
+    held = {name: rows for name, rows in whole.items() if not name.startswith("text")}
+    save_file(held, file, metadata={"format": "pt"})
+    first = "text_model.embeddings.position_embedding.weight"
+    with pytest.raises(ValueError, match=f"must be a whole model, got no weights {first} and 20 m"):
+        ClipText(model=str(tmp_path)).encode(["mug"])
+    numbers = {"text_model.embeddings.position_ids": torch.arange(77)[None]}  # of older files
+    save_file(whole | numbers, file, metadata={"format": "pt"})
+    assert ClipText(model=str(tmp_path)).encode(["mug"]).shape == (1, 12)
+
+
+def half(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def wider(content: bytes) -> bytes:
+    config = json.loads(content)
+    config["text_config"]["hidden_size"] = 32
+    return json.dumps(config).encode()
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("model.safetensors", half),
+        ("model.safetensors", lambda _: b""),
+        ("config.json", half),
+        ("config.json", wider),
+        ("config.json", lambda _: b"[]"),
+        ("config.json", lambda _: b'{"model_type": "nosuch"}'),
+        ("config.json", lambda _: b'{"model_type": "clip", "projection_dim": "wide"}'),
+        ("tokenizer.json", half),
+        ("tokenizer.json", lambda _: b"{}"),
+        ("tokenizer.json", lambda _: b"null"),
+        ("tokenizer_config.json", half),
+        ("pytorch_model.bin", lambda _: b""),
+        ("pytorch_model.bin", lambda _: b'cos\nsystem\n(S"true"\ntR.'),
+    ],
+)
+def test_damaged_files_are_one_error(tmp_path: Path, name: str, damage: Callable[[bytes], bytes]):
+    save_clip(tmp_path)
+    file = tmp_path / name
+    if name.endswith(".bin"):
+        (tmp_path / "model.safetensors").rename(file)
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(ValueError, match=r": files must be a .*model.*, got \w+:") as e:
+        ClipText(model=str(tmp_path)).encode(["mug"])
+    assert str(e.value).startswith(str(tmp_path))
+    assert "\n" not in str(e.value)
 
 
 def test_encoders_keep_the_contract():

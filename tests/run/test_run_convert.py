@@ -21,7 +21,9 @@ from vlgs.formats import write_autoencoder
 from vlgs.gaussians import STANDARD, read_ply, write_ply
 from vlgs.gaussians.ply import PLAIN
 from vlgs.heads.autoencoder import Autoencoder, AutoencoderTraining
+from vlgs.opened.files import write_scene as write_notes
 from vlgs.run import run
+from vlgs.runs import RunFolder
 from vlgs.types import Scene
 
 PARAMETERS = tuple(STANDARD)[:8]
@@ -111,6 +113,57 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
     assert str(stopped.value).startswith("error: ")
     assert message in str(stopped.value)
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["scene", "points.ply"], "OUT must be a .json or a folder for cameras, got points.ply, a"),
+        (["scene", "a.PTH", "--as", "colmap"], "OUT must be a .json or a folder for cameras"),
+        (["scene", "out", "--drop"], "--drop must go with Gaussians, got cameras"),
+        (["scene", "t.json", "--drop"], "--drop must go with Gaussians, got cameras in a .json"),
+        (["scene", "t.json", "--as", "splat"], "--as must not be given for cameras in a .json"),
+        (
+            ["scene", "out", "--as", "splat"],
+            "--as must be colmap or colmap-text for cameras, got s",
+        ),
+        (["b.pth", "a.safetensors", "--drop"], "--drop must go with Gaussians, got an autoencoder"),
+        (["b.pth", "a.safetensors", "--as", "3dgs"], "--as must not be given for an autoencoder"),
+        (["maps", "dim3", "--head", "b.pth", "--drop"], "--drop must go with Gaussians, got lang"),
+        (
+            ["maps", "dim3", "--head", "b.pth", "--as", "vlgs"],
+            "--as must not be given for language",
+        ),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+):
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path / "scene", n=3)
+    head = Autoencoder(training=AutoencoderTraining(steps=2))
+    head.fit(torch.randn(8, 16), torch.ones(8))
+    write_autoencoder(tmp_path / "b.pth", head)
+    (tmp_path / "maps").mkdir()
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert str(stopped.value).startswith("error: convert: ")
+    assert message in str(stopped.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (500_123.0, 5_412_345.5, 312.0)])
+def test_a_run_says_what_was_subtracted(
+    tmp_path: Path, tiny_scene: Scene, origin: tuple[float, float, float]
+):
+    run = RunFolder(tmp_path / "run")
+    run.path.mkdir()
+    write_ply(run.ply, some_gaussians(), notes=[PLAIN])
+    write_notes(run, replace(tiny_scene, origin=origin), [None])
+    said = [line for line in convert(run.path, tmp_path / "a.ply") if "subtracted" in line]
+    far = ["beware: (500123, 5412345.5, 312) is subtracted from all positions"]
+    assert said == (far if any(origin) else [])
 
 
 def test_colmap_to_colmap_keeps_tracks(tmp_path: Path):

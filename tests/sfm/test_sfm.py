@@ -1,5 +1,6 @@
 """Cameras from photographs: refusals, resuming and what is left behind at once; a real reconstruction is slow."""
 
+import io
 import json
 import shlex
 import shutil
@@ -248,12 +249,64 @@ def test_a_crash_of_the_worker_is_one_error(
 
 def test_work_of_other_settings_is_begun_anew_and_equal_work_kept(tmp_path: Path):
     work = tmp_path / ".out.sfm"
-    module._prepare(work, {"seed": 0})
+    said = io.StringIO()
+    screen = Console(file=said, soft_wrap=True)
+    module._prepare(work, {"seed": 0, "threads": 2}, screen)
     (work / "database.db").write_bytes(b"rows")
-    module._prepare(work, {"seed": 0})
+    module._prepare(work, {"seed": 0, "threads": 4}, screen)
     assert (work / "database.db").is_file()
-    module._prepare(work, {"seed": 1})
+    assert json.loads((work / "settings.json").read_text())["threads"] == 4  # the worker's
+    assert said.getvalue() == ""
+    module._prepare(work, {"seed": 1, "threads": 4}, screen)
     assert not (work / "database.db").exists()
+    assert said.getvalue() == f"earlier work in {work} is deleted; changed: seed\n"
+    (work / "settings.json").write_text("half of a fi")
+    module._prepare(work, {"seed": 1, "threads": 4}, screen)
+    assert said.getvalue().endswith("changed: settings.json\n")
+
+
+def test_another_number_of_threads_goes_on_with_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "worker.py").write_text("raise SystemExit('stopped')")
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "reconstruct.py"))
+    images, work = photographs(tmp_path / "images"), tmp_path / ".out.sfm"
+
+    def call(*options: str) -> str:
+        with pytest.raises(SystemExit, match="COLMAP must end well"):
+            main([str(images), str(tmp_path / "out"), *options])
+        return capsys.readouterr().out
+
+    call()
+    settings = json.loads((work / "settings.json").read_text())
+    del settings["photographs"]  # as earlier versions left it
+    (work / "settings.json").write_text(json.dumps(settings))
+    (work / "database.db").write_bytes(b"rows")
+    assert "deleted" not in call("--threads", "4")
+    assert (work / "database.db").is_file()
+    shutil.rmtree(images)
+    photographs(images, seed=1)
+    assert "is deleted; changed: photographs\n" in call("--threads", "4")
+    assert not (work / "database.db").exists()
+
+
+def test_other_photographs_of_the_same_names_are_another_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    fake_colmap(monkeypatch, tmp_path)
+    first, second = (photographs(tmp_path / name, seed=i) for i, name in enumerate("ab"))
+    out = tmp_path / "out"
+    made = reconstruct(first, out, SfmOptions(), QUIET)
+    with pytest.raises(
+        FileExistsError, match="got other photographs of the same names; delete it or choose"
+    ):
+        reconstruct(second, out, SfmOptions(), QUIET)
+    moved = first.rename(tmp_path / "c")  # the same photographs elsewhere
+    assert reconstruct(moved, out, SfmOptions(), QUIET).points == made.points
+    report = json.loads((out / "sfm.json").read_text())
+    del report["made"]["photographs"]  # as earlier versions left it
+    (out / "sfm.json").write_text(json.dumps(report))
+    assert reconstruct(second, out, SfmOptions(), QUIET).points == made.points
 
 
 def test_pairs_are_counted_as_colmap_makes_them():

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vlgs.data.sparse import AT_HOME, subtracted
 from vlgs.export.content import Content, answer, drawn, most_important, selected
 from vlgs.export.page import write_page
 from vlgs.files import write_atomically
@@ -103,6 +104,8 @@ def _said(opened: OpenedRun, target: Path, kind: str, content: Content) -> list[
     if kind == "page":
         words = ", ".join(word.name for word in content.words)
         lines.append(f"words: {words}" if words else "no words")
+    elif opened.notes.origin != AT_HOME:
+        lines.append(subtracted(opened.notes.origin))
     return [*lines, *content.notes]
 
 

@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,23 @@ class FeatureFolder:
 
     path: Path
 
-    def require_same(self, settings: Mapping[str, Any]) -> None:
+    @property
+    def has_settings(self) -> bool:
+        """Whether the maps are known to be of this program."""
+        return (self.path / SETTINGS).is_file()
+
+    def require_same(self, settings: Mapping[str, Any], unknown: Collection[str] = ()) -> None:
         """Do nothing if the folder is empty or was made with these settings.
+
+        Args:
+            settings: Of the maps.
+            unknown: Keys that are not compared.
 
         Raises:
             ValueError: If it was made with others (it says which), or its maps were made by another program.
         """
         file = self.path / SETTINGS
-        if not file.is_file():
+        if not self.has_settings:
             if self.path.is_dir() and any(self.path.glob("*_[sf].npy")):
                 raise ValueError(
                     f"features: {self.path} must be empty or have a {SETTINGS}, got language maps of another program; "
@@ -44,7 +53,10 @@ class FeatureFolder:
                 raise TypeError(f"{type(before).__name__} instead of a mapping")
         except TypeError as error:
             raise ValueError(f"{file}: content must be a JSON of settings, got {error}") from error
-        old, new = _flat(before), _flat(settings)
+        old, new = (
+            _flat({key: value for key, value in each.items() if key not in unknown})
+            for each in (before, settings)
+        )
         changed = sorted(k for k in old.keys() | new.keys() if old.get(k) != new.get(k))
         if changed:
             differences = "; ".join(f"{k} was {old.get(k)}, is {new.get(k)}" for k in changed[:8])

@@ -57,11 +57,31 @@ class Job:
         Raises:
             FileNotFoundError: If weights are missing.
         """
+        return {**self._given(), "read": dict(self.extractor.identity())}
+
+    def require_same_when_done(self) -> None:
+        """Do nothing if maps that are all there are what this job would make, or of another program.
+
+        Without weights only the settings are compared.
+
+        Raises:
+            ValueError: If they were made with other settings.
+        """
+        if not self.folder.has_settings:
+            return
+        self.folder.require_same(self._given(), unknown=["read"])
+        try:
+            settings = self.settings()
+        except (OSError, ValueError):  # no weights here, or not the package that finds them
+            return
+        self.folder.require_same(settings)
+
+    def _given(self) -> dict[str, Any]:
+        """Settings that are known without weights."""
         return {
             "version": _VERSION,
             "max_height": self.max_height,
             "extractor": self.extractor_settings,
-            "read": dict(self.extractor.identity()),
         }
 
     def pixels(self, view: ViewSource) -> UInt8[np.ndarray, "h w 3"]:
@@ -119,6 +139,7 @@ def run(job: Job, console: Console) -> Iterator[str]:
     """
     todo = job.todo()
     if not todo:
+        job.require_same_when_done()
         return
     job.folder.require_same(job.settings())
     columns = (
@@ -154,6 +175,7 @@ def estimate(job: Job) -> Iterator[str]:
     todo = job.todo()
     yield f"photographs {len(todo)} to do of {len(job.views)}, to {job.folder.path}"
     if not todo:
+        job.require_same_when_done()
         return
     vectors, width = 400, 512  # a usual SAM photograph; measured where that can be
     guess = f"if a photograph has {vectors} masks"

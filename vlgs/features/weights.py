@@ -10,6 +10,7 @@ import torch
 from vlgs.data.diagnostics import SceneError
 from vlgs.data.untrusted.text import read_json
 from vlgs.extras import require_extra
+from vlgs.queries.text import load_whole
 
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"
 WEIGHTS, SHARDS = "model.safetensors", "model.safetensors.index.json"
@@ -107,19 +108,13 @@ class Pretrained:
 
         Raises:
             FileNotFoundError: As `folder`.
-            ValueError: If the files do not hold such a model.
+            ValueError: If the files do not hold such a model, or not all of it.
         """
-        from safetensors import SafetensorError
         from transformers.utils import logging
 
         folder = self.folder()
         logging.disable_progress_bar()  # ours is on the screen
-        try:
-            model = auto.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-        except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
-            raise ValueError(
-                f"{folder}: files must be a whole model of {self.name}, got {type(error).__name__}: {error}"
-            ) from error
+        model = load_whole(auto, folder, f"a whole model of {self.name}", use_safetensors=True)
         return model.eval().requires_grad_(False).to(self.device)
 
     def _candidate(self) -> Path:

@@ -226,12 +226,14 @@ def _number(
 
 
 def _reconstruction(path: Path, origin: Origin) -> list[NamedCamera]:
-    """Cameras of COLMAP or of a transforms.json, by name, without distortion, as photographs are read."""
+    """Cameras without distortion, as photographs are read: of COLMAP by name, of other files in their order."""
     model = moved(read_cameras(path), origin)
     file = str(model.file("cameras"))
     lenses = {c.camera_id: make_lens(c, (c.width, c.height), 1.0, file) for c in model.cameras}
     frames = []
-    images = sorted(model.images, key=lambda image: image.name)
+    images = list(model.images)
+    if model.suffix in (".bin", ".txt"):  # whose order is that of registration or of none
+        images.sort(key=lambda image: image.name)
     names = _distinct([image.name for image in images])
     for image, name in zip(images, names, strict=True):
         lens = lenses[image.camera_id]

@@ -12,9 +12,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from vlgs.extras import require_extra
 from vlgs.files import write_atomically
-from vlgs.queries.text import ClipText
+from vlgs.queries.text import ClipText, find_model
+
+_MODEL_FILES = frozenset({".safetensors", ".bin", ".json", ".txt", ".model"})
+"""Suffixes of what a vector depends on."""
 
 
 def cache_folder() -> Path:
@@ -50,6 +52,9 @@ class CachedText:
         weights = _weights_of(self.tower.model)
         paths = {name: cache_folder() / f"{self._key(weights, name)}.safetensors" for name in names}
         rows = {name: _read(path) for name, path in paths.items()}
+        for row in rows.values():
+            if row is not None:
+                self.tower.require_width(len(row))
         new = [name for name, row in rows.items() if row is None]
         if new:
             vectors = self.tower.encode([self.template.replace("{}", name) for name in new])
@@ -64,18 +69,15 @@ class CachedText:
 
 
 def _weights_of(model: str) -> list[str]:
-    """What tells one set of weights from another without reading half a gigabyte: files, their sizes and when they were written."""
-    folder = Path(model)
-    if not folder.is_dir():
-        require_extra("huggingface_hub", "features")
-        from huggingface_hub import snapshot_download
-        from huggingface_hub.errors import LocalEntryNotFoundError
+    """What tells one set of weights from another without reading half a gigabyte: files, their sizes and when they were written.
 
-        try:
-            folder = Path(snapshot_download(model, local_files_only=True))
-        except (LocalEntryNotFoundError, ValueError):
-            return [model]  # the tower says what is missing
-    found = [(path.name, path.stat()) for path in sorted(folder.glob("*.safetensors"))]
+    Those of the tokenizer and the configuration count too.
+    """
+    folder = find_model(model)
+    if folder is None:
+        return [model]  # the tower says what is missing
+    files = (path for path in sorted(folder.iterdir()) if path.suffix in _MODEL_FILES)
+    found = [(path.name, path.stat()) for path in files if path.is_file()]
     return [model, *(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in found)]
 
 

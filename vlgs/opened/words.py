@@ -54,7 +54,8 @@ class Words:
             )
         known = [VocabularyText(table) for table in (added, own) if table is not None]
         model = model or config.get("model")
-        tower = None if model is None else CachedText(ClipText(own, str(model)), template)
+        first = known[0].vocabulary if known else None
+        tower = None if model is None else CachedText(ClipText(first, str(model)), template)
         return cls(known, tower)
 
     @property

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from vlgs.data.labels.pictures import find_pngs, marked
 from vlgs.data.untrusted.pictures import picture
 from vlgs.fields import Field
 from vlgs.types import Scene, View
@@ -58,10 +59,10 @@ class OwnMasks:
 
 @dataclass(frozen=True)
 class MaskFolder:
-    """Pictures ``<folder>/<word>/<view>.png`` of a detector, or drawn by hand: a pixel that is not black belongs to the word.
+    """Pictures ``<folder>/<word>/<view>.png`` of a detector, or drawn by hand.
 
-    A picture is of the photograph as training sees it, undistorted, at any resolution. Of several training views that have one for a word the
-    first counts.
+    A pixel that is neither black nor transparent belongs to the word. A picture is of the photograph as training sees it, undistorted, at any
+    resolution. Of several training views that have one for a word the first counts.
     """
 
     folder: str
@@ -102,7 +103,7 @@ class MaskFolder:
         """Word -> view -> picture. Folders are listed, so that no word leads out of them."""
         folder = Path(self.folder)
         words = sorted(folder.iterdir()) if folder.is_dir() else []
-        return {word.name: {path.stem: path for path in word.glob("*.png")} for word in words}
+        return {word.name: {path.stem: path for path in find_pngs(word)} for word in words}
 
 
 def masks_from(folder: str | None, candidates: int) -> OwnMasks | MaskFolder:
@@ -126,12 +127,14 @@ def _nearest(scene: Scene, word: Float[Tensor, " e"]) -> Iterator[Found]:
 def _read_mask(path: Path, size: tuple[int, int]) -> Bool[Tensor, "h w"]:
     """A picture at the size of a view: each pixel has what the middle of it shows."""
     with picture(path, decode=True) as image:
-        inside = np.asarray(image.convert("RGB")).max(axis=2) > 0
+        inside = marked(image)
     rows, columns = (
         ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size, inside.shape, strict=True)
     )
     mask = torch.from_numpy(inside[rows][:, columns])
     if not mask.any() or mask.all():
         got = "all of them" if mask.any() else "none"
-        raise ValueError(f"query: {path} must have some pixels that are not black, got {got}")
+        raise ValueError(
+            f"query: {path} must have some pixels that are neither black nor transparent, got {got}"
+        )
     return mask

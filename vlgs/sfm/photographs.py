@@ -1,5 +1,7 @@
 """The photographs of a folder, and which of them one camera took."""
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 
 from PIL import ExifTags, Image
@@ -43,6 +45,21 @@ def find_photographs(images: Path) -> dict[Device, list[str]]:
             f"sfm: photographs must have different names, got {listing(twice)} more than once"
         )
     return groups
+
+
+def digest_photographs(images: Path, names: Iterable[str]) -> str:
+    """Hash of the names and contents of photographs.
+
+    Args:
+        images: Their folder.
+        names: Below it, in an order that is always the same.
+    """
+    hasher = hashlib.blake2b(digest_size=16)
+    for name in names:
+        with (images / name).open("rb") as stream:
+            content = hashlib.file_digest(stream, "blake2b").digest()
+        hasher.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
+    return hasher.hexdigest()
 
 
 def _exif_camera(image: Image.Image) -> tuple[str, ...]:

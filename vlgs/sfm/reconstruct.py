@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from vlgs.data.diagnostics import listing
 from vlgs.files import write_atomically
-from vlgs.sfm.photographs import find_photographs
+from vlgs.sfm.photographs import digest_photographs, find_photographs
 from vlgs.sfm.result import REPORT, Reconstruction, count_apart, read_finished
 
 _EXHAUSTIVE_UP_TO = 120
@@ -90,7 +90,9 @@ def reconstruct(images: Path, out: Path, options: SfmOptions, console: Console) 
     if options.matching == "auto":
         many = len(names) > _EXHAUSTIVE_UP_TO
         chosen["matching"] = "sequential" if many else "exhaustive"
-    made = {"options": {k: v for k, v in chosen.items() if k != "threads"}, "names": names}
+    digest = digest_photographs(images, names)
+    options_made = {k: v for k, v in chosen.items() if k != "threads"}
+    made = {"options": options_made, "names": names, "photographs": digest}
     if out.exists() and (found := read_finished(out, made)) is not None:
         console.print("this scene exists, nothing was computed")
         return found
@@ -98,7 +100,8 @@ def reconstruct(images: Path, out: Path, options: SfmOptions, console: Console) 
     if place.is_relative_to(images.resolve()):
         raise ValueError(f"sfm: OUT must lie outside of the photographs in {images}, got {out}")
     work = place.with_name(f".{place.name}.sfm")
-    _prepare(work, {**chosen, "images": str(images.resolve()), "names": names, "groups": groups})
+    taken = {"names": names, "groups": groups, "photographs": digest}
+    _prepare(work, {**chosen, "images": str(images.resolve()), **taken}, console)
     _run(work, console, len(names), _pairs(len(names), chosen["matching"], options.overlap))
     models = json.loads((work / "models.json").read_text(encoding="utf-8"))
     if not models:
@@ -129,16 +132,29 @@ ADVICE = (
 )
 
 
-def _prepare(work: Path, settings: dict[str, Any]) -> None:
+def _prepare(work: Path, settings: dict[str, Any], console: Console) -> None:
     """The work folder, emptied if it was for other settings."""
     file = work / "settings.json"
     text = json.dumps(settings, indent=2)
-    if file.is_file() and file.read_text(encoding="utf-8") != text:
-        shutil.rmtree(work)
-    elif work.is_dir() and not file.is_file() and any(work.iterdir()):
+    if file.is_file():
+        if changed := _changed(file, settings):
+            console.print(f"earlier work in {work} is deleted; changed: {changed}")
+            shutil.rmtree(work)
+    elif work.is_dir() and any(work.iterdir()):
         raise FileExistsError(f"sfm: {work} must be a folder of an earlier run, got other files")
     work.mkdir(parents=True, exist_ok=True)
     write_atomically(file, text.encode())
+
+
+def _changed(file: Path, settings: dict[str, Any]) -> str:
+    """Names of the settings that are not those of a file, but for what moves no camera; empty if there are none."""
+    try:
+        before = dict(json.loads(file.read_text(encoding="utf-8")))
+    except (ValueError, TypeError):
+        return file.name
+    before.setdefault("photographs", settings.get("photographs"))  # earlier versions have none
+    keys = sorted((before.keys() | settings.keys()) - {"threads"})
+    return ", ".join(key for key in keys if before.get(key) != settings.get(key))
 
 
 def _run(work: Path, console: Console, photographs: int, pairs: int) -> None:

@@ -43,6 +43,10 @@ def count_apart(registered: set[str], parts: Sequence[set[str]]) -> tuple[int, .
 def read_finished(out: Path, made: dict[str, Any]) -> Reconstruction | None:
     """What an earlier call made in a folder; None where the folder is empty.
 
+    Args:
+        out: The folder.
+        made: Options, and the photographs' names and digest. Scenes of earlier versions have no digest; there the names count.
+
     Raises:
         FileExistsError: If it holds anything else, or was made from other photographs or with other options.
     """
@@ -65,6 +69,8 @@ def read_finished(out: Path, made: dict[str, Any]) -> Reconstruction | None:
     ]
     if names != made["names"]:
         changed.insert(0, f"{len(names)} photographs, now {len(made['names'])} or others")
+    elif before.get("photographs", made["photographs"]) != made["photographs"]:
+        changed.insert(0, "other photographs of the same names")
     if changed:
         raise FileExistsError(
             f"sfm: {out} must be made from the same photographs with the same options, got {listing(changed)}; delete it "

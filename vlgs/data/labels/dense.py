@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vlgs.data.diagnostics import Fault, SceneError, listing
+from vlgs.data.labels.pictures import find_pngs
 from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.text import read_json
 from vlgs.types import IGNORE_ID
@@ -78,7 +79,10 @@ def open_dense(folder: Path) -> tuple[DenseFolder | None, tuple[Fault, ...]]:
     counted = [(i, entry) for i, entry in by_id if not entry.get("ignore", False)]
     position = {i: IGNORE_ID for i, _ in by_id} | {IGNORE_ID: IGNORE_ID}
     position |= {i: n for n, (i, _) in enumerate(counted)}
-    files = {file.stem: file for file in sorted(folder.glob("*.png"))}
+    files = {file.stem: file for file in find_pngs(folder)}
+    if not files:
+        what = "label images must be at least 1, got 0"
+        faults.append(Fault(str(folder), what, "name them <stem>.png"))
     sizes = {}
     for stem, file in files.items():
         try:

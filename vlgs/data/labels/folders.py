@@ -3,7 +3,7 @@
 3D-OVS: ``classes.txt`` (a class per line) and ``<stem>/<class>.png``.
 GOI on Mip-NeRF 360: ``<prompt>/masks/<stem>.png``.
 
-A pixel that is not 0 belongs to the class. There are no boxes: a hit of the localisation is a pixel of the mask.
+A pixel that is neither black nor transparent belongs to the class. There are no boxes: a hit of the localisation is a pixel of the mask.
 """
 
 from collections.abc import Mapping
@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float64
 
 from vlgs.data.diagnostics import Fault, SceneError, listing, warning
 from vlgs.data.labels.objects import ObjectFolder
+from vlgs.data.labels.pictures import find_pngs, marked
 from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.text import read_text
 
@@ -53,7 +54,7 @@ class MaskedImage:
 
     def _read(self, path: Path) -> Bool[np.ndarray, "h w"]:
         with picture(path, decode=True) as image:
-            pixels = np.asarray(image.convert("RGB")).max(axis=2) > 0
+            pixels = marked(image)
         if pixels.shape != (self.height, self.width):
             what = f"size must be {self.width} x {self.height}, got {pixels.shape[::-1]}"
             raise SceneError(Fault(str(path), what))
@@ -73,7 +74,7 @@ def open_class_folders(folder: Path) -> tuple[ObjectFolder | None, tuple[Fault, 
         return None, (Fault(str(path), what),)
     faults: list[Fault] = []
     found: dict[str, dict[str, Path]] = {}
-    for mask in sorted(folder.glob("*/*.png")):
+    for mask in find_pngs(folder, "*/*"):
         if mask.stem in classes:
             found.setdefault(mask.parent.name, {})[mask.stem] = mask
         else:
@@ -85,7 +86,7 @@ def open_class_folders(folder: Path) -> tuple[ObjectFolder | None, tuple[Fault, 
 def open_prompt_folders(folder: Path) -> tuple[ObjectFolder | None, tuple[Fault, ...]]:
     """GOI's labels of one scene; the classes are the prompts."""
     found: dict[str, dict[str, Path]] = {}
-    for mask in sorted(folder.glob("*/masks/*.png")):
+    for mask in find_pngs(folder, "*/masks/*"):
         found.setdefault(mask.stem, {})[mask.parents[1].name] = mask
     classes = tuple(sorted({category for masks in found.values() for category in masks}))
     return _open(folder, classes, found, [])

@@ -12,7 +12,14 @@ from vlgs.data.sparse.model import (
     image_faults,
     model_faults,
 )
-from vlgs.data.sparse.origin import AT_HOME, Origin, moved, origin_of, origin_warnings
+from vlgs.data.sparse.origin import (
+    AT_HOME,
+    Origin,
+    moved,
+    origin_of,
+    origin_warnings,
+    subtracted,
+)
 from vlgs.data.sparse.transforms import write_transforms
 
 __all__ = [
@@ -30,6 +37,7 @@ __all__ = [
     "origin_warnings",
     "read_cameras",
     "read_sparse",
+    "subtracted",
     "write_transforms",
 ]
 

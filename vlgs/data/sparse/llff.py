@@ -12,6 +12,7 @@ import torch
 from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.images import SUFFIXES
 from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
+from vlgs.data.sparse.transforms import is_rotation
 from vlgs.data.untrusted.arrays import map_npy
 from vlgs.geometry import rotmat_to_quat
 
@@ -22,7 +23,7 @@ def read_llff(path: Path) -> SparseModel:
     """Cameras and poses; the images are those in ``images/`` beside the file.
 
     Raises:
-        SceneError: If the file is not such an array, or has not one row for each image.
+        SceneError: If the file is not such an array, has not one row for each image, or has axes that are no rotation.
     """
     rows = map_npy(path)
     names = sorted(
@@ -35,11 +36,15 @@ def read_llff(path: Path) -> SparseModel:
     images = []
     for number, (name, row) in enumerate(zip(names, rows[:, :15].astype(np.float64), strict=True)):
         down, right, back, center, (height, width, focal) = row.reshape(3, 5).T
+        turn = np.stack([right, down, -back])  # world to camera
+        if not is_rotation(turn):
+            what = "axes must be down, right and back, of length 1 and at right angles"
+            got = [down.tolist(), right.tolist(), back.tolist()]
+            raise SceneError(Fault(str(path), f"{what}, got {got}", where=f"row {number}"))
         key = (round(float(width)), round(float(height)), float(focal))
         middle = (key[0] / 2, key[1] / 2)
         new = SparseCamera(len(cameras) + 1, "SIMPLE_PINHOLE", *key[:2], (key[2], *middle))
         camera = cameras.setdefault(key, new)
-        turn = np.stack([right, down, -back])  # world to camera
         quat = rotmat_to_quat(torch.from_numpy(turn))
         translation = tuple((-turn @ center).tolist())
         pose = (tuple(quat.tolist()), translation)

@@ -55,7 +55,19 @@ def origin_warnings(model: SparseModel, origin: Origin) -> Iterator[Fault]:
     """That a scene is not in the coordinates of its model."""
     if origin == AT_HOME:
         return
-    place = ", ".join(f"{value:.12g}" for value in origin)
-    what = f"cameras should be within {FARTHEST:g} of their extents from the origin, got them about ({place})"
-    advice = "that is subtracted from all positions, and results are in what is left, where float32 is fine enough"
+    what = (
+        f"cameras should be within {FARTHEST:g} of their extents from the origin, got farther ones"
+    )
+    advice = f"{subtracted(origin)}, and results are in what is left, where float32 is fine enough"
     yield warning(model.file("images"), what, advice)
+
+
+def subtracted(origin: Origin) -> str:
+    """What is told of positions about another origin.
+
+    Example:
+        >>> subtracted((500124.2, 5412345.3, 309.0))
+        '(500124.2, 5412345.3, 309) is subtracted from all positions'
+    """
+    place = ", ".join(f"{value:.12g}" for value in origin)
+    return f"({place}) is subtracted from all positions"

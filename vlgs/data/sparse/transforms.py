@@ -22,6 +22,7 @@ from plyfile import PlyData, PlyElement
 
 from vlgs.data.diagnostics import Fault, SceneError
 from vlgs.data.sparse.model import SparseCamera, SparseImage, SparseModel
+from vlgs.data.sparse.origin import AT_HOME, origin_of
 from vlgs.data.untrusted.pictures import picture
 from vlgs.data.untrusted.ply import read_vertices
 from vlgs.data.untrusted.text import read_json
@@ -33,6 +34,7 @@ _POINTS = "sparse_pc.ply"
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes <-> OpenCV's."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_CHANNELS = ("red", "green", "blue")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MOST = 1e9
 _LONGEST_PATH = 4096
@@ -111,17 +113,7 @@ def write_transforms(path: Path, model: SparseModel, images: str = "images") -> 
         frames.append(frame if len(lenses) == 1 else frame | lenses[image.camera_id])
     content: dict[str, Any] = dict(next(iter(lenses.values()))) if len(lenses) == 1 else {}
     if len(model.points):
-        rows = np.empty(
-            len(model.points),
-            [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")],
-        )
-        for column, axis in enumerate("xyz"):
-            rows[axis] = model.points[:, column]
-        for column, channel in enumerate(("red", "green", "blue")):
-            rows[channel] = model.point_colors[:, column]
-        stream = io.BytesIO()
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
-        write_atomically(points, stream.getvalue())
+        write_atomically(points, _encode_points(model))
         content["ply_file_path"] = _POINTS
     content["frames"] = frames
     try:
@@ -130,6 +122,20 @@ def write_transforms(path: Path, model: SparseModel, images: str = "images") -> 
         if len(model.points) and not known:
             points.unlink()
         raise
+
+
+def _encode_points(model: SparseModel) -> bytes:
+    """The points as a PLY: in float32 as elsewhere, in doubles where that is too coarse for the scene."""
+    far = bool(model.images) and origin_of(model) != AT_HOME
+    columns = [(axis, "<f8" if far else "<f4") for axis in "xyz"]
+    rows = np.empty(len(model.points), columns + [(channel, "u1") for channel in _CHANNELS])
+    for column, axis in enumerate("xyz"):
+        rows[axis] = model.points[:, column]
+    for column, channel in enumerate(_CHANNELS):
+        rows[channel] = model.point_colors[:, column]
+    stream = io.BytesIO()
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
+    return stream.getvalue()
 
 
 def _names_points(path: Path) -> bool:
@@ -179,9 +185,16 @@ def _matrix(path: Path, where: str, value: Any) -> Float64[np.ndarray, "4 4"]:
     matrix = np.eye(4)
     matrix[:3] = rows[:3]
     turn = matrix[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+    if not is_rotation(turn):
         raise SceneError(Fault(str(path), f"{what}, got axes {turn.tolist()}", where=where))
     return matrix
+
+
+def is_rotation(axes: Float64[np.ndarray, "3 3"]) -> bool:
+    """Whether axes are right-handed, of unit length and at right angles, to a thousandth."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of axes beyond any length
+        off = np.abs(axes @ axes.T - np.eye(3)).max()
+    return bool(off <= 1e-3 and np.linalg.det(axes) > 0)
 
 
 def _lens(
@@ -250,14 +263,31 @@ def _read_points(
     expected = "ply_file_path must be a PLY with x y z red green blue"
     try:
         vertices = read_vertices(file)
-        with np.errstate(invalid="ignore"):  # NaN is no colour; it becomes some
-            channels = [vertices[name].astype(np.uint8) for name in ("red", "green", "blue")]
+        colors = _as_bytes(file, np.stack([vertices[name] for name in _CHANNELS], axis=1))
         points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (OSError, KeyError) as error:
         raise SceneError(
             Fault(str(file), f"{expected}, got {type(error).__name__}: {error}")
         ) from error
-    return points, np.stack(channels, axis=1)
+    return points, colors
+
+
+def _as_bytes(file: Path, colors: np.ndarray) -> UInt8[np.ndarray, "p 3"]:
+    """Colours of 0 to 255, of a file that has them so, as floats of 0 to 1 or in 16 bits."""
+    if colors.dtype == np.uint8:
+        return colors
+    kind, size = colors.dtype.kind, colors.dtype.itemsize
+    values = np.where(np.isnan(colors), 0, colors).astype(np.float64)  # NaN is no colour
+    low, high = values.min(initial=0.0), values.max(initial=0.0)
+    scale = 1.0
+    if kind == "f" and high < 1.001:  # of 255 all would be black; some programs round to above 1
+        scale = 255.0
+    elif (kind, size) == ("u", 2) and high > 255:  # else of 65535 all would be black
+        scale = 1 / 257
+    if low < -0.5 / scale or high >= 255.5 / scale:
+        what = "colours must be 0 to 255, 0 to 1 as floats or 0 to 65535 as ushort of a binary file"
+        raise SceneError(Fault(str(file), f"{what}, got {low:g} to {high:g}"))
+    return np.rint(values * scale).astype(np.uint8)
 
 
 def _written_lens(path: Path, camera: SparseCamera) -> dict[str, Any]:
@@ -270,11 +300,11 @@ def _written_lens(path: Path, camera: SparseCamera) -> dict[str, Any]:
         "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
         "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     }.get(camera.model)
-    fx, fy, cx, cy = camera.intrinsics()
     bent = camera.params[len(camera.params) - len(keys or ()) :]
     if keys is None or (camera.model == "FULL_OPENCV" and any(bent[5:])):
         what = "cameras must be perspective with k1, k2, k3, p1, p2, or OPENCV_FISHEYE"
         raise ValueError(f"transforms {path}: {what}, got {camera.model} {camera.params}")
+    fx, fy, cx, cy = camera.intrinsics()
     fisheye = camera.model == "OPENCV_FISHEYE"
     named = {key: value for key, value in zip(keys, bent, strict=True) if key in _DISTORTION}
     model = "OPENCV_FISHEYE" if fisheye else "OPENCV" if named else "PINHOLE"
