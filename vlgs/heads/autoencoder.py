@@ -43,7 +43,7 @@ class AutoencoderTraining:
     """At the top of the cycle."""
     area_power: float = 0.25
     """A mask is drawn in proportion to its area to this power: at 1 a thing that covers little is never seen apart
-    from its neighbours, at 0 every mask counts the same as in LangSplat."""
+    from its neighbours, at 0 every mask counts the same as in LangSplat. At most 2: higher powers of areas overflow."""
     code_noise: float = 0.15
     """Standard deviation of the noise on the codes at the last step, rising from 0: it holds the codes of different
     things apart, because a rendered code is never quite the one that was learnt."""

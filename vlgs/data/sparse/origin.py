@@ -55,11 +55,9 @@ def origin_warnings(model: SparseModel, origin: Origin) -> Iterator[Fault]:
     """That a scene is not in the coordinates of its model."""
     if origin == AT_HOME:
         return
-    what = (
-        f"cameras should be within {FARTHEST:g} of their extents from the origin, got farther ones"
-    )
+    what = f"cameras should be within {FARTHEST:g} of their extents from the origin"
     advice = f"{subtracted(origin)}, and results are in what is left, where float32 is fine enough"
-    yield warning(model.file("images"), what, advice)
+    yield warning(model.file("images"), f"{what}, got farther ones", advice)
 
 
 def subtracted(origin: Origin) -> str:
