@@ -88,6 +88,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     **dict.fromkeys(("stages.lift.border", "stages.lift.alike", "stages.lift.trial"), 0),
     "query.masks": None,
     "stages": None,
+    **dict.fromkeys(("trainer.average_language", "trainer.average_color"), 0),
     "trainer.color_decay": 1,
     "trainer.exposure": False,
     "trainer.half_size": 0,

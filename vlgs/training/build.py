@@ -45,6 +45,16 @@ class Parts:
     raster: RasterConfig
     trainer: TrainerConfig
 
+    def __post_init__(self) -> None:
+        """Refuse a mean of iterations in which Gaussians come and go."""
+        trainer, stop = self.trainer, self.gaussians.densify.stop
+        averaged = trainer.average_language or trainer.average_color
+        if averaged and stop >= trainer.iterations:
+            raise ValueError(
+                "trainer: average_language and average_color must have iterations after gaussians.densify.stop, "
+                f"got {stop} of {trainer.iterations}"
+            )
+
 
 def scaled(parts: Parts, share: float) -> Parts:
     """The parts with a share of the iterations: what is said in iterations from the start shrinks or grows alike, intervals of densification stay."""

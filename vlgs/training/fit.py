@@ -14,6 +14,7 @@ from lightning.pytorch.loggers import Logger
 from vlgs.ops.machine import freed_memory_kept
 from vlgs.runs import RunFolder
 from vlgs.training.after_step import TrainedModule
+from vlgs.training.average import Average
 from vlgs.training.callbacks import (
     Checkpoints,
     ClearAir,
@@ -60,7 +61,13 @@ class _Steps:
 
 def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | None:
     """Train Gaussians to the end of their budget; see `train_on`."""
-    changes = [StuckAlarm(module.settings.log_every), Densification(), ClearAir(), Silence()]
+    changes = [
+        StuckAlarm(module.settings.log_every),
+        Densification(),
+        Average(),
+        ClearAir(),
+        Silence(),
+    ]
     return train_on(module, partial(restore, module), changes, folder, options)
 
 

@@ -17,6 +17,7 @@ from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
 from vlgs.training.exposure import Exposure
+from vlgs.training.means import Means
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
 
@@ -94,6 +95,7 @@ class VLGSModule(L.LightningModule):
             settings,
         )
         self.optimizer = self._make_optimizer()
+        self.means = Means()
         self.next_step = 0
         self.train_seconds = 0.0
         self.report = StepReport()

@@ -93,6 +93,11 @@ class TrainerConfig:
     """Share of their rates that codes and indicators have left in the end, after half a cosine over the run; 1: they stay."""
     color_decay: float = 1.0
     """The same for quats, log_scales, opacity_logits, sh0 and shN; positions have `LearningRates.means_final`."""
+    average_language: float = 0.0
+    """Share of the iterations, the last ones, over which codes and indicators are averaged in the end (`vlgs.training.average`); 0: their last
+    values stand."""
+    average_color: float = 0.0
+    """The same for all else that is trained."""
     rates_for: int | None = None
     """Iterations that the rates of positions, shapes, opacities and colours are made for: in a budget of others they are sqrt(rates_for / iterations)
     times as large. None: they are as they stand."""
@@ -117,6 +122,7 @@ class TrainerConfig:
             )
 
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
+        shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
@@ -145,6 +151,11 @@ class TrainerConfig:
         )
         fallen = (1 - math.cos(math.pi * min(step / self.iterations, 1.0))) / 2
         return (self.pace if name in _COLOR else 1) * (1 + (end - 1) * fallen)
+
+    def average(self, name: str) -> float:
+        """Share of the iterations, the last ones, whose mean a parameter takes in the end; of the Gaussians' by ``splats.`` and its name."""
+        language = name.removeprefix("splats.") in _LANGUAGE
+        return self.average_language if language else self.average_color
 
     def is_half_size(self, step: int) -> bool:
         """Whether an iteration sees views at half their size."""

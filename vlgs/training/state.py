@@ -21,6 +21,7 @@ def capture(module: VLGSModule, meta: dict[str, Any]) -> Checkpoint:
                 tensors[f"adam.{group['name']}.{index}.{key}"] = value
     tensors["densify.grad_sum"] = module.densifying.state.grad_sum
     tensors["densify.count"] = module.densifying.state.count
+    tensors |= {f"mean.{name}": tensor for name, tensor in module.means.state().items()}
     own = {
         "train_seconds": module.train_seconds,
         "results_version": RESULTS_VERSION,
@@ -52,6 +53,7 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
                 module.optimizer.state[parameter] = state
     module.densifying.state.grad_sum = checkpoint.tensors["densify.grad_sum"]
     module.densifying.state.count = checkpoint.tensors["densify.count"]
+    module.means.restore(_below(checkpoint.tensors, "mean."))
     module.next_step = checkpoint.step
     module.train_seconds = float(checkpoint.meta["train_seconds"])
     module.skips.restore(checkpoint.meta.get("skips", {}))
