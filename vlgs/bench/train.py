@@ -82,7 +82,7 @@ RECIPES: dict[str, tuple[str, ...]] = {
     "no skips": _skips(on=False),
     "short": ("trainer.iterations=500", "trainer.sh_every=100", "gaussians.densify.start=100", "gaussians.densify.stop=350"),
     "paper": ("trainer=paper",),
-    "paper, half size": ("trainer=paper", "trainer.half_size=0.5"),
+    "paper, half size": ("trainer=paper", "trainer.half_size=0.7"),
     "photos": ("trainer=photos",),
     "fast photos": ("trainer=fast_photos",),
 }  # fmt: skip
