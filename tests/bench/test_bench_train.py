@@ -4,12 +4,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from vlgs.bench import curve, train
 from vlgs.bench.curve import evaluated_at, seconds_to
 from vlgs.bench.presets import composed
-from vlgs.bench.record import STYLE, plain_ticks, read_record
+from vlgs.bench.record import STYLE, plain_ticks, read_record, write_record
 from vlgs.identity import RESULTS_VERSION
 from vlgs.skips import SKIPS
 from vlgs.training.after_step import TrainedModule
@@ -89,6 +90,38 @@ def test_rows_of_other_seeds_stay_and_effects_are_paired_by_seed(
     assert list(read_record(tmp_path / "train.csv").seed) == [2]
 
 
+def test_sizes_of_a_scene_are_apart_and_a_recipe_looks_alike_on_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def row(size: str, label: str, run: str) -> train.Summary:
+        point = curve.CurvePoint("fox", label, 6, 1.0, 1.0, 20.0, None, 9)
+        if run != "gone":
+            write_record(tmp_path / "train" / f"fox-{run}.csv", [point], {})
+        return train.Summary(
+            "fox", size, label, "", 0, run, RESULTS_VERSION, 6, 1.0, 1.0, 20.0, None, 9,
+            19.0, 1.0, 1.0, None, None, None,
+        )  # fmt: skip
+
+    figures: list[Figure] = []
+    monkeypatch.setattr(train, "write_figure", lambda _, figure: figures.append(figure))
+    before = [
+        row("8x6", "photos", "12345678"),
+        row("8x6", "default", "b"),
+        row("4x3", "fast", "gone"),
+    ]
+    write_record(tmp_path / "train.csv", before, {})
+    rows = train.with_others(tmp_path / "train.csv", [row("4x3", "default", "c")])
+    assert [(r.size, r.label, r.run) for r in rows] == [
+        ("8x6", "photos", "12345678"), ("8x6", "default", "b"), ("4x3", "fast", "gone"), ("4x3", "default", "c"),
+    ]  # fmt: skip
+    train.draw_train(tmp_path / "train", rows)
+    panels = figures[0].axes
+    assert [p.get_title(loc="left") for p in panels[::2]] == ["fox, 8x6", "fox, 4x3"]
+    (_, large), (small,) = (p.get_lines() for p in panels[::2])
+    assert large.get_color() == small.get_color()
+    assert [text.get_text() for text in panels[1].texts] == ["not scored"]
+
+
 def test_evaluation_is_not_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(1000))
     monkeypatch.setattr(curve.time, "perf_counter", lambda: float(next(clock)))
@@ -151,7 +184,6 @@ def test_a_training_that_was_stopped_goes_on_with_its_clocks_and_points(
 def test_labels_of_the_seconds_do_not_run_into_each_other(ends: tuple[float, float]):
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     with rc_context(STYLE):
         figure = Figure(figsize=(8.0, 2.9), layout="constrained")

@@ -108,7 +108,7 @@ def read_record(path: Path) -> pd.DataFrame:
         raise FileNotFoundError(
             f"bench: {path} must exist, got none; python -m vlgs.bench {path.stem} makes it"
         )
-    return pd.read_csv(path, comment="#")
+    return pd.read_csv(path, comment="#", dtype={"run": str})  # an id may be digits alone
 
 
 def plain_ticks(axis: "Axis") -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 import torch
 
-from vlgs.bench.curve import Curve, CurvePoint, curve_path, evaluated_at, seconds_to
+from vlgs.bench.curve import Curve, curve_path, evaluated_at, seconds_to
 from vlgs.bench.memory import peak_bytes
 from vlgs.bench.presets import Trained, build, composed
 from vlgs.bench.record import (
@@ -99,9 +99,13 @@ class Summary:
     """One line of train.csv."""
 
     scene: str
+    size: str
+    """WIDTHxHEIGHT of the first training view, in pixels."""
     label: str
     overrides: str
     seed: int
+    run: str
+    """Run id: its curve is `train/SCENE-RUN.csv`."""
     results_version: int
     iterations: int
     seconds: float
@@ -169,9 +173,9 @@ def run_train(
     """Train what has no curve yet, seed by seed; write train.csv and train.png, print the tables.
 
     A curve is written when its training ends and is not trained again: its file is named after the run id, so that a change of
-    configuration, data or results version gives a new one. Rows of other scenes, recipes and seeds stay in train.csv while they are of
-    the same results version. Without targets they are 1 dB and 0.02 below the end of ``default`` (of the first label where it is not
-    among them).
+    configuration, data or results version gives a new one. Rows of other scenes, sizes, recipes and seeds stay in train.csv while they are
+    of the same results version; the picture has the curves of all its rows of the first seed. Without targets they are 1 dB and 0.02 below
+    the end of ``default`` (of the first label where it is not among them).
     """
     header = provenance(
         None,
@@ -187,16 +191,16 @@ def run_train(
                 curve = _curve(kind, label, overrides, out, points, threads, seed)
                 found[str(curve.scene.iloc[0]), label] = curve
         rows += _summaries(found, targets, seed)
-        write_record(path, _beside(path, rows), header)
-        if seed == seeds[0]:
-            draw_train(out / "train", found)
+        written = with_others(path, rows)
+        write_record(path, written, header)
+        draw_train(out / "train", [row for row in written if row.seed == seeds[0]])
     _print(rows)
     if len(labels) > 1:
         _print_effects(rows, labels[0])
     return rows
 
 
-def _beside(path: Path, rows: Sequence[Summary]) -> list[Summary]:
+def with_others(path: Path, rows: Sequence[Summary]) -> list[Summary]:
     """The rows, after those of the file that are of other trainings and today's results version."""
     if not path.is_file():
         return list(rows)
@@ -204,16 +208,15 @@ def _beside(path: Path, rows: Sequence[Summary]) -> list[Summary]:
     if set(table.columns) != {field.name for field in fields(Summary)}:
         return list(rows)
     lines = table.where(table.notna(), None).to_dict(orient="records")
-    mine = {(row.scene, row.label, row.seed) for row in rows}
+    mine = {_of(row) for row in rows}
     known = [Summary(**{str(key): value for key, value in line.items()}) for line in lines]
-    return [
-        *(
-            k
-            for k in known
-            if k.results_version == RESULTS_VERSION and (k.scene, k.label, k.seed) not in mine
-        ),
-        *rows,
-    ]
+    kept = (k for k in known if k.results_version == RESULTS_VERSION and _of(k) not in mine)
+    return [*kept, *rows]
+
+
+def _of(row: Summary) -> tuple[str, str, str, int]:
+    """What a training has one row for."""
+    return row.scene, row.size, row.label, row.seed
 
 
 def _curve(
@@ -231,10 +234,12 @@ def _curve(
     torch.set_num_threads(threads)
     scene = experiment.read_scene()
     name = f"{scene.name}_large" if kind == "large" else scene.name
-    path = curve_path(out / "train", name, experiment.run_id(scene.fingerprint))
+    run, camera = experiment.run_id(scene.fingerprint), scene.train[0].camera
+    known = {"label": label, "size": f"{camera.width}x{camera.height}", "run": run}
+    path = curve_path(out / "train", name, run)
     if path.is_file():
         say(f"{name}, {label}: {path} is there")
-        return read_record(path).assign(label=label)
+        return read_record(path).assign(**known)
     say(f"{name}, {label}: {iterations} iterations ...")
     told = " ".join(without_places([*overrides]))
     header = provenance(seed, overrides=told, training_threads=threads)
@@ -252,11 +257,7 @@ def _curve(
         )
         write_record(path, curve.points, {**header, "peak": peak})
     shutil.rmtree(folder.path)
-    return _frame(curve.points)
-
-
-def _frame(points: Sequence[CurvePoint]) -> pd.DataFrame:
-    return pd.DataFrame([vars(point) for point in points])
+    return pd.DataFrame([vars(point) for point in curve.points]).assign(**known)
 
 
 def _values(curve: pd.DataFrame, column: str) -> list[float | None]:
@@ -284,8 +285,8 @@ def _summaries(
             psnrs, mious = _values(curve, "psnr"), _values(curve, "miou")
             rows.append(
                 Summary(
-                    scene, label, " ".join(RECIPES[label]), seed, RESULTS_VERSION, int(curve.iteration.iloc[-1]), wall[-1], cpu[-1],
-                    psnrs[-1], mious[-1], int(curve.gaussians.iloc[-1]),
+                    scene, curve["size"].iloc[0], label, " ".join(RECIPES[label]), seed, curve.run.iloc[0], RESULTS_VERSION,
+                    int(curve.iteration.iloc[-1]), wall[-1], cpu[-1], psnrs[-1], mious[-1], int(curve.gaussians.iloc[-1]),
                     psnr, seconds_to(psnr, wall, psnrs), seconds_to(psnr, cpu, psnrs),
                     miou, seconds_to(miou, wall, mious), seconds_to(miou, cpu, mious),
                 )
@@ -293,40 +294,53 @@ def _summaries(
     return rows
 
 
-def draw_train(stem: Path, curves: dict[tuple[str, str], pd.DataFrame]) -> None:
-    """PSNR and mIoU against seconds of training, one row per scene."""
+def draw_train(stem: Path, rows: Sequence[Summary]) -> None:
+    """PSNR and mIoU of every row against seconds of training, one line of panels per scene and size.
+
+    Args:
+        stem: Where the picture goes, without suffix; the curves are in the folder of this name.
+        rows: Of one seed. Those whose curve is gone are left out.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    scenes = list(dict.fromkeys(scene for scene, _ in curves))
+    scenes: dict[str, dict[str, pd.DataFrame]] = {}
+    looks: dict[str, tuple[str, str]] = {}  # colour and line: a recipe looks alike on every scene
+    for row in rows:
+        path = curve_path(stem, row.scene, row.run)
+        if path.is_file():
+            scenes.setdefault(f"{row.scene}, {row.size}", {})[row.label] = read_record(path)
+            turn, color = divmod(len(looks), len(COLORS))
+            looks.setdefault(row.label, (COLORS[color], ("-", "--", ":")[turn % 3]))
     with rc_context(STYLE):
         figure = Figure(figsize=(8.0, 2.9 * len(scenes)), layout="constrained")
         panels = figure.subplots(len(scenes), 2, squeeze=False)
-        for scene, line in zip(scenes, panels, strict=True):
-            mine = {label: curve for (where, label), curve in curves.items() if where == scene}
+        for (scene, curves), line in zip(scenes.items(), panels, strict=True):
+            line[0].set_title(scene, fontsize=8, loc="left")
             for panel, column, name in zip(
                 line, ("psnr", "miou"), ("PSNR, dB", "mIoU"), strict=True
             ):
-                _draw_curves(panel, mine, column)
+                _draw_curves(panel, curves, column, looks)
                 panel.set_ylabel(f"{name}, held-out views")
-                panel.set_title(scene, fontsize=8)
-            line[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+            names, labels = line[0].get_legend_handles_labels()
+            line[1].legend(names, labels, loc="center left", bbox_to_anchor=(1.0, 0.5))
         write_figure(stem, figure)
 
 
-def _draw_curves(panel: "Axes", curves: dict[str, pd.DataFrame], column: str) -> None:
-    styles = ("-", "--")
-    for i, (label, curve) in enumerate(curves.items()):
-        color, style = COLORS[i % len(COLORS)], styles[i // len(COLORS) % 2]
+def _draw_curves(
+    panel: "Axes",
+    curves: dict[str, pd.DataFrame],
+    column: str,
+    looks: dict[str, tuple[str, str]],
+) -> None:
+    if all(curve[column].isna().all() for curve in curves.values()):
+        panel.set_axis_off()
+        panel.text(0.5, 0.5, "not scored", ha="center", transform=panel.transAxes)
+        return
+    for label, curve in curves.items():
+        color, ls = looks[label]
         panel.plot(
-            curve.seconds,
-            curve[column],
-            marker="o",
-            ms=2.5,
-            lw=1,
-            ls=style,
-            color=color,
-            label=label,
+            curve.seconds, curve[column], marker="o", ms=2.5, lw=1, color=color, ls=ls, label=label
         )
     panel.set_xscale("log")
     plain_ticks(panel.xaxis)
