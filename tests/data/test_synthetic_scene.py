@@ -1,5 +1,6 @@
 """The scenes as training and evaluation see them."""
 
+import gc
 import inspect
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +18,7 @@ from vlgs.data.synthetic import NO_NOISE, LabelNoise, SceneSettings, capture, lo
 from vlgs.data.synthetic.labels import components, object_labels
 from vlgs.data.synthetic.layouts import DIFFICULTIES
 from vlgs.data.synthetic.scene_file import find_scene
+from vlgs.data.untrusted.arrays import Archive
 from vlgs.geometry import camera_center
 from vlgs.types import ObjectLabels, Scene, View
 
@@ -136,15 +138,29 @@ def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, ca
     assert same(load_scene(**cached, points=7), load_scene(**SMALL, points=7))
     [file] = (tmp_path / "cache").iterdir()
 
-    capture._kept_beside.cache_clear()  # as another process would begin
     monkeypatch.setattr(capture, "photograph", lambda *_: pytest.fail("traced again"))
     assert same(traced, load_scene(**cached))
 
     monkeypatch.undo()
-    capture._kept_beside.cache_clear()
     file.write_bytes(file.read_bytes()[:1000])
     assert same(traced, load_scene(**cached))
     assert "could not be read" in caplog.text
+
+
+def test_mask_levels_share_what_scenes_need_of_the_photographs(tmp_path, monkeypatch):
+    cached: dict[str, Any] = SMALL | {"cache": str(tmp_path)}
+    read, whole = [], Archive.read
+    monkeypatch.setattr(Archive, "read", lambda *a: read.append(a[1]) or whole(*a))
+
+    def held() -> list[str]:
+        gc.collect()
+        return [field for file, *_, field in capture._in_use if file.is_relative_to(tmp_path)]
+
+    scenes = [load_scene(**cached, level=level) for level in (1, 2, 3)]
+    assert sorted(held()) == ["image", "part"]
+    assert [read.count(field) for field in ("image", "part", "distance")] == [1, 1, 3]
+    scenes.clear()
+    assert not held()
 
 
 def test_readers_hand_out_values_that_nobody_can_spoil(scene):

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import BinaryIO
+from weakref import WeakValueDictionary
 
 import numpy as np
 from jaxtyping import Int
@@ -64,21 +65,15 @@ def open_capture(settings: SceneSettings, cache: Path | None = None) -> Capture:
 
     Args:
         settings: Of the scene; its points and faults do not matter here.
-        cache: Folder that keeps photographs between processes; those of the last scene then stay in memory, else those of the last two.
+        cache: Folder that keeps photographs between processes; what nobody uses of them then leaves the memory, else the last two captures stay.
     """
     same = replace(settings, points=0, faults=NO_NOISE)
-    return _kept(same) if cache is None else _kept_beside(same, cache)
+    return _kept(same) if cache is None else _open(same, cache)
 
 
 @functools.lru_cache(maxsize=2)
 def _kept(settings: SceneSettings) -> Capture:
     return _open(settings, None)
-
-
-@functools.lru_cache(maxsize=1)
-def _kept_beside(settings: SceneSettings, cache: Path) -> Capture:
-    """Three mask levels of one scene share one copy."""
-    return _open(settings, cache)
 
 
 def _open(settings: SceneSettings, cache: Path | None) -> Capture:
@@ -115,19 +110,33 @@ def _photographs(
     if cache is None:
         return _taken(world, cameras, settings)
     file = cache / f"capture-{settings.fingerprint(level=0)}.npz"
-    names = [field.name for field in fields(TracedImage)]
     try:
-        with Archive(file, "photographs of the scene") as kept:
-            stacks = [kept.read(name, "fiub") for name in names]
-        return [TracedImage(*arrays) for arrays in zip(*stacks, strict=True)]
+        return _read(file)
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
-    photos = _taken(world, cameras, settings)
     cache.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, functools.partial(_write, photos))
-    return photos
+    write_atomically(file, functools.partial(_write, _taken(world, cameras, settings)))
+    return _read(file)
+
+
+_in_use: WeakValueDictionary[tuple[Path, int, int, str], np.ndarray] = WeakValueDictionary()
+"""File, when it was written, its bytes, field -> that of all photographs, while a scene holds it: mask levels of one scene share a copy."""
+
+
+def _read(file: Path) -> list[TracedImage]:
+    """Photographs of a file. A scene keeps the images and the parts; the rest, more than half of the bytes, goes when it is made."""
+    with Archive(file, "photographs of the scene") as kept:
+        state = file.stat()
+        stacks = []
+        for field in fields(TracedImage):
+            key = file, state.st_mtime_ns, state.st_size, field.name
+            stack = _in_use.get(key)
+            if stack is None:
+                stack = _in_use[key] = kept.read(field.name, "fiub")
+            stacks.append(stack)
+    return [TracedImage(*arrays) for arrays in zip(*stacks, strict=True)]
 
 
 def _write(photos: Sequence[TracedImage], file: BinaryIO) -> None:

@@ -142,14 +142,14 @@ class Archive:
                 if header.length + header.size != info.file_size:
                     declared = f"{header.dtype} {list(header.shape)}"
                     raise fail(f"{info.file_size - header.length} bytes of values for {declared}")
-                values = np.empty(header.size, np.uint8)
-                _fill(stream.read, values, fail)
+                # The array owns its memory, so that it is alive exactly while a part of it is in use.
+                values = np.empty(header.shape, header.dtype, "F" if header.fortran else "C")
+                _fill(stream.read, values.ravel("K").view(np.uint8), fail)
         except SceneError:
             raise
         except _BROKEN_ZIP as error:
             raise fail(f"{type(error).__name__}: {error}") from None
-        order = "F" if header.fortran else "C"
-        return values.view(header.dtype).reshape(header.shape, order=order)
+        return values
 
     def fail(self, what: str, advice: str = COPY_AGAIN) -> SceneError:
         """The error that the content is something else."""
