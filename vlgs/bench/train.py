@@ -59,6 +59,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
     "paper's rates of language": (f"{_RATE}features=5e-3", f"{_RATE}indicator_logits=5e-2"),
     "rates that stay": ("trainer.color_decay=1",),
     "positions that come to rest": (f"{_RATE}means_final=1.6e-6",),
+    "last values": ("trainer.average_color=0", "trainer.average_language=0"),
     "whole views": ("trainer.half_size=0",),
     "harmonics a twentieth": (f"{_RATE}shN=2.5e-4",),
     "3DGS's densification": (
