@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.colmap_scenes import write_scene
 from vlgs.bench import unseen
 from vlgs.bench.__main__ import main
 from vlgs.bench.lonely import share_lonely, view_weights
@@ -65,6 +66,19 @@ def test_photographs_that_are_not_there_are_left_out(tmp_path: Path):
     assert [task.scene for task in tasks] == ["mirrors_sky"]
     with pytest.raises(ValueError, match="scenes must be at least one that is there"):
         make_tasks(["fox"], [20], tmp_path, 0.5, quick=False)
+
+
+def test_photographs_are_held_out_as_asked(tmp_path: Path):
+    write_scene(tmp_path / "fox")
+
+    def held(*splits: str) -> list[str]:
+        tasks = make_tasks(["fox"], [], tmp_path, 1.0, quick=False, splits=splits)
+        return [task.split for task in tasks]
+
+    assert (held("a tenth"), held("every 8th")) == (["a tenth"], ["every 8th"])
+    assert held("a tenth", "every 8th") == ["every 8th", "a tenth"]
+    with pytest.raises(ValueError, match=r"splits must be among .*, got .'every 9th'"):
+        held("every 9th")
 
 
 def test_lonely_gaussians_are_those_that_training_views_do_not_see():

@@ -140,6 +140,9 @@ def unseen(parser: ArgumentParser) -> Runner:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--root", type=Path, help="folder of the scenes of photographs")
     parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
+    parser.add_argument(
+        "--splits", nargs="+", default=["every 8th", "a tenth"], help="what is held out of them"
+    )
     parser.add_argument("--recipe", default="default", help="a name for what --override changes")
     parser.add_argument("--override", nargs="+", default=[], metavar="KEY=VALUE")
     parser.add_argument("--train-threads", type=int, default=1)
@@ -149,7 +152,7 @@ def unseen(parser: ArgumentParser) -> Runner:
 
         scenes = args.scenes or [*PROCEDURAL, *PHOTOGRAPHS]
         views, seeds = ([4], [args.seed]) if args.quick else (args.views, args.seeds)
-        tasks = make_tasks(scenes, views, args.root, args.resize, args.quick)
+        tasks = make_tasks(scenes, views, args.root, args.resize, args.quick, args.splits)
         run_unseen(tasks, {args.recipe: args.override}, seeds, args.out, args.train_threads)
         return 0
 

@@ -36,6 +36,8 @@ PROCEDURAL = ("glassware_ring", "mirrors_sky", "lookalikes_wall")
 TRAIN_VIEWS = (12, 20, 40)
 PHOTOGRAPHS = ("fox", "dtu_scan65", "camvid_0016E5")
 """Folders below `--root`; a folder that is not there is left out."""
+SPLITS = ("every 8th", "a tenth")
+"""What is held out of photographs; the tenth is contiguous."""
 HELD_OUT = 8
 SIZE = ("data.width=120", "data.height=90")
 QUICK = ("data.width=48", "data.height=36", "data.points=400", "trainer=smoke")  # fmt: skip
@@ -51,13 +53,20 @@ class Task:
 
 
 def make_tasks(
-    scenes: Sequence[str], views: Sequence[int], root: Path | None, resize: float, quick: bool
+    scenes: Sequence[str],
+    views: Sequence[int],
+    root: Path | None,
+    resize: float,
+    quick: bool,
+    splits: Sequence[str] = SPLITS,
 ) -> list[Task]:
-    """Procedural scenes at every number of views; photographs below `root`, with two ways of holding out.
+    """Procedural scenes at every number of views; photographs below `root`, with every one of the `splits`.
 
     Raises:
-        ValueError: If nothing is left.
+        ValueError: If a split is unknown, or nothing is left.
     """
+    if unknown := sorted({*splits} - {*SPLITS}):
+        raise ValueError(f"bench: splits must be among {list(SPLITS)}, got {unknown}")
     small = QUICK if quick else SIZE
     tasks = [
         Task(scene, f"{count} views", (
@@ -72,9 +81,12 @@ def make_tasks(
             continue
         given = ("data=colmap", f"data.root={root / scene}", f"data.resize={resize}")
         given += QUICK[-1:] if quick else ("trainer=photos",)
-        tenth = ",".join(_middle_tenth([*given, "data.split=all"]))
-        tasks.append(Task(scene, "every 8th", (*given, "data.split=llff")))
-        tasks.append(Task(scene, "a tenth", (*given, "data.split=list", f"data.test=[{tenth}]")))
+        if "every 8th" in splits:
+            tasks.append(Task(scene, "every 8th", (*given, "data.split=llff")))
+        if "a tenth" in splits:
+            tenth = ",".join(_middle_tenth([*given, "data.split=all"]))
+            held_out = ("data.split=list", f"data.test=[{tenth}]")
+            tasks.append(Task(scene, "a tenth", (*given, *held_out)))
     if not tasks:
         raise ValueError(f"bench: scenes must be at least one that is there, got {list(scenes)}")
     return tasks
