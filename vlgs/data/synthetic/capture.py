@@ -3,7 +3,7 @@
 import functools
 import logging
 import zipfile
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 _LAYOUT, _WALK, _EXPOSURE = 100, 101, 103  # purposes of draws; `masks` and `scene` have others
 _PATCHES = 1 << 16
+_FIELDS = tuple(field.name for field in fields(TracedImage))
 
 
 @dataclass(frozen=True)
@@ -108,58 +109,77 @@ def _photographs(
     world: World, cameras: list[Camera], settings: SceneSettings, cache: Path | None
 ) -> list[TracedImage]:
     if cache is None:
-        return _taken(world, cameras, settings)
+        return _split(_taken(world, cameras, settings))
     file = cache / f"capture-{settings.fingerprint(level=0)}.npz"
     try:
-        return _read(file)
+        return _split(_read(file))
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
+    stacks = _taken(world, cameras, settings)
     cache.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, functools.partial(_write, _taken(world, cameras, settings)))
-    return _read(file)
+    write_atomically(file, functools.partial(_write, stacks))
+    _in_use.update((_key(file, field), stack) for field, stack in stacks.items())
+    return _split(stacks)
 
 
 _in_use: WeakValueDictionary[tuple[Path, int, int, str], np.ndarray] = WeakValueDictionary()
-"""File, when it was written, its bytes, field -> that of all photographs, while a scene holds it: mask levels of one scene share a copy."""
+"""What stands in a file, while a scene holds a part of it: mask levels of one scene share a copy. A scene keeps the images and the
+parts; the rest, more than half of the bytes, goes when it is made."""
 
 
-def _read(file: Path) -> list[TracedImage]:
-    """Photographs of a file. A scene keeps the images and the parts; the rest, more than half of the bytes, goes when it is made."""
+def _key(file: Path, field: str) -> tuple[Path, int, int, str]:
+    """What tells a field of a file from that of another that took its place."""
+    state = file.stat()
+    return file, state.st_mtime_ns, state.st_size, field
+
+
+def _split(stacks: Mapping[str, np.ndarray]) -> list[TracedImage]:
+    return [TracedImage(*arrays) for arrays in zip(*stacks.values(), strict=True)]
+
+
+def _read(file: Path) -> dict[str, np.ndarray]:
+    stacks = {}
     with Archive(file, "photographs of the scene") as kept:
-        state = file.stat()
-        stacks = []
-        for field in fields(TracedImage):
-            key = file, state.st_mtime_ns, state.st_size, field.name
+        for field in _FIELDS:
+            key = _key(file, field)
             stack = _in_use.get(key)
             if stack is None:
-                stack = _in_use[key] = kept.read(field.name, "fiub")
-            stacks.append(stack)
-    return [TracedImage(*arrays) for arrays in zip(*stacks, strict=True)]
+                stack = _in_use[key] = kept.read(field, "fiub")
+            stacks[field] = stack
+    return stacks
 
 
-def _write(photos: Sequence[TracedImage], file: BinaryIO) -> None:
-    """As `numpy.savez` of one stack per field, without ever holding one: hundreds of large photographs are gigabytes."""
+def _write(stacks: Mapping[str, np.ndarray], file: BinaryIO) -> None:
+    """As `numpy.savez`, an image at a time."""
     with zipfile.ZipFile(file, "w") as archive:
-        for field in fields(TracedImage):
-            arrays = [getattr(photo, field.name) for photo in photos]
+        for field, stack in stacks.items():
             header = {
-                "descr": np.lib.format.dtype_to_descr(arrays[0].dtype),
+                "descr": np.lib.format.dtype_to_descr(stack.dtype),
                 "fortran_order": False,
-                "shape": (len(arrays), *arrays[0].shape),
+                "shape": stack.shape,
             }
-            with archive.open(f"{field.name}.npy", "w", force_zip64=True) as member:
+            with archive.open(f"{field}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, header)
-                for array in arrays:
+                for array in stack:
                     member.write(array.tobytes())
 
 
-def _taken(world: World, cameras: list[Camera], settings: SceneSettings) -> list[TracedImage]:
+def _taken(world: World, cameras: list[Camera], settings: SceneSettings) -> dict[str, np.ndarray]:
+    """All photographs, one array per field: hundreds of large ones are gigabytes, which pieces of the heap would keep after they went."""
     rng = np.random.default_rng([_EXPOSURE, settings.seed])
     gains = exposures(settings.scene.exposure, settings.train_views, rng).tolist()
     gains += [1.0] * settings.test_views  # held-out photographs come last
-    return [photograph(world, *taken) for taken in zip(cameras, gains, strict=True)]
+    stacks: dict[str, np.ndarray] = {}
+    for place, taken in enumerate(zip(cameras, gains, strict=True)):
+        photo = photograph(world, *taken)
+        for field in _FIELDS:
+            array = getattr(photo, field)
+            if not place:
+                stacks[field] = np.empty((len(cameras), *array.shape), array.dtype)
+            stacks[field][place] = array
+    return stacks
 
 
 def regions(
