@@ -11,7 +11,7 @@ from vlgs.bench import unseen
 from vlgs.bench.__main__ import main
 from vlgs.bench.lonely import share_lonely, view_weights
 from vlgs.bench.presets import train_a_little
-from vlgs.bench.record import read_record
+from vlgs.bench.record import read_record, write_record
 from vlgs.bench.unseen import QUICK, make_tasks, summary
 from vlgs.bench.unseen_row import UnseenRow
 
@@ -59,6 +59,12 @@ def test_spread_is_over_seeds_and_worst_over_views():
     assert line.miou_spread == pytest.approx(0.1)
     assert (line.means["psnr"], line.means["worst"]) == (30.5, 22.0)
     assert line.means["miou_lerf_ovs"] is None
+
+
+def test_names_of_digits_come_back_as_they_were(tmp_path: Path):
+    row = UnseenRow("fox", "a tenth", "default", 0, "1e5", 3, "12", 30, 27, "0110", 0.9, None, None, 0, 9, 1)  # fmt: skip
+    write_record(tmp_path / "unseen.csv", [row], {})
+    assert unseen._read(tmp_path / "unseen.csv") == [row]
 
 
 def test_photographs_that_are_not_there_are_left_out(tmp_path: Path):

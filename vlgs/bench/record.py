@@ -108,7 +108,8 @@ def read_record(path: Path) -> pd.DataFrame:
         raise FileNotFoundError(
             f"bench: {path} must exist, got none; python -m vlgs.bench {path.stem} makes it"
         )
-    return pd.read_csv(path, comment="#", dtype={"run": str})  # an id may be digits alone
+    names = ("run", "commit", "worst_view")  # which may be digits alone
+    return pd.read_csv(path, comment="#", dtype=dict.fromkeys(names, str))
 
 
 def plain_ticks(axis: "Axis") -> None:
