@@ -152,7 +152,9 @@ NO_GAUSSIANS = "the field has no Gaussians"
 """Why a figure that speaks of Gaussians is not available."""
 
 
-NO_LANGUAGE = "the field has no language: it was made to show colour alone"
+NO_LANGUAGE = (
+    "the field has no language: its scene has no language maps, or its method learns colour alone"
+)
 """Why a figure that speaks of words is not available."""
 
 
