@@ -102,7 +102,7 @@ def test_nothing_is_averaged_by_default(tiny_scene: Scene, tmp_path: Path):
 def test_a_mean_over_gaussians_that_come_and_go_is_refused():
     with pytest.raises(
         ValueError,
-        match=r"^trainer: average_language and average_color must have iterations after gaussians\.densify\.stop, got 24 of 24$",
+        match=r"^trainer: average_language and average_color must have iterations after gaussians\.densify\.stop, got 24 of 24; 0 turns them off$",
     ):
         parts_of("trainer.average_language=0.2", f"gaussians.densify.stop={STEPS}")
 

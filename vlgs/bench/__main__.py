@@ -140,19 +140,18 @@ def unseen(parser: ArgumentParser) -> Runner:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--root", type=Path, help="folder of the scenes of photographs")
     parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
-    parser.add_argument(
-        "--splits", nargs="+", default=["every 8th", "a tenth"], help="what is held out of them"
-    )
+    parser.add_argument("--splits", nargs="+", help="of them: every 8th, a tenth; default: both")
     parser.add_argument("--recipe", default="default", help="a name for what --override changes")
     parser.add_argument("--override", nargs="+", default=[], metavar="KEY=VALUE")
     parser.add_argument("--train-threads", type=int, default=1)
 
     def run(args: Namespace) -> int:
-        from vlgs.bench.unseen import PHOTOGRAPHS, PROCEDURAL, make_tasks, run_unseen
+        from vlgs.bench.unseen import PHOTOGRAPHS, PROCEDURAL, SPLITS, make_tasks, run_unseen
 
         scenes = args.scenes or [*PROCEDURAL, *PHOTOGRAPHS]
         views, seeds = ([4], [args.seed]) if args.quick else (args.views, args.seeds)
-        tasks = make_tasks(scenes, views, args.root, args.resize, args.quick, args.splits)
+        splits = args.splits or SPLITS
+        tasks = make_tasks(scenes, views, args.root, args.resize, args.quick, splits)
         run_unseen(tasks, {args.recipe: args.override}, seeds, args.out, args.train_threads)
         return 0
 

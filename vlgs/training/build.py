@@ -52,7 +52,7 @@ class Parts:
         if averaged and stop >= trainer.iterations:
             raise ValueError(
                 "trainer: average_language and average_color must have iterations after gaussians.densify.stop, "
-                f"got {stop} of {trainer.iterations}"
+                f"got {stop} of {trainer.iterations}; 0 turns them off"
             )
 
 

@@ -2,11 +2,9 @@
 
 import functools
 import logging
-import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import BinaryIO
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -119,7 +117,7 @@ def _photographs(
         log.warning("synthetic: %s could not be read (%s) and is made again", file, error)
     stacks = _taken(world, cameras, settings)
     cache.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, functools.partial(_write, stacks))
+    write_atomically(file, lambda stream: np.savez(stream, allow_pickle=False, **stacks))
     _in_use.update((_key(file, field), stack) for field, stack in stacks.items())
     return _split(stacks)
 
@@ -149,21 +147,6 @@ def _read(file: Path) -> dict[str, np.ndarray]:
                 stack = _in_use[key] = kept.read(field, "fiub")
             stacks[field] = stack
     return stacks
-
-
-def _write(stacks: Mapping[str, np.ndarray], file: BinaryIO) -> None:
-    """As `numpy.savez`, an image at a time."""
-    with zipfile.ZipFile(file, "w") as archive:
-        for field, stack in stacks.items():
-            header = {
-                "descr": np.lib.format.dtype_to_descr(stack.dtype),
-                "fortran_order": False,
-                "shape": stack.shape,
-            }
-            with archive.open(f"{field}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array_header_1_0(member, header)
-                for array in stack:
-                    member.write(array.tobytes())
 
 
 def _taken(world: World, cameras: list[Camera], settings: SceneSettings) -> dict[str, np.ndarray]:
