@@ -81,6 +81,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.near_share": 0,
     "gaussians.densify.share_weights": False,
     "gaussians.densify.by_error": False,
+    "gaussians.densify.prune_unseen": 0,
     "indicator.copies": 1,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),

@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.fields.splat import SplatModel
-from vlgs.ops.rasterize import rasterize
-from vlgs.types import Camera, ChannelGroup, Scene
+from vlgs.training.lift import gathered
+from vlgs.types import Camera, Scene
 
 SEEN = 0.1
 """A view sees a Gaussian that has this weight in it, summed over pixels: a tenth of one pixel."""
@@ -26,24 +26,7 @@ def share_lonely(model: SplatModel, scene: Scene) -> float:
 
 
 def view_weights(model: SplatModel, camera: Camera) -> Float[Tensor, " n"]:
-    """Weight of every Gaussian in the colour of one view, summed over pixels: what it has after all before it.
-
-    An image of ones is linear in the values that are blended, so that its gradient by them is these weights.
-    """
-    gaussians = model.gaussians()
-    with torch.enable_grad():
-        ones = torch.ones(model.count, 1, requires_grad=True)
-        group = ChannelGroup(ones, gaussians.opacities.detach())
-        image = rasterize(
-            gaussians.means.detach(),
-            gaussians.quats.detach(),
-            gaussians.scales.detach(),
-            [group],
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            config=model.raster,
-        ).images[0]
-        (weights,) = torch.autograd.grad(image.sum(), ones)
-    return weights[:, 0]
+    """Weight of every Gaussian in the colour of one view, summed over pixels: what it has after all before it."""
+    ones = torch.ones(camera.height, camera.width, 1)
+    opacities = model.gaussians().opacities.detach()
+    return gathered(model, camera, opacities, ones, of_color=True)[:, 0]

@@ -66,6 +66,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
         "gaussians.densify.share_weights=false",
         "gaussians.densify.by_error=false",
     ),
+    "what no view shows stays": ("gaussians.densify.prune_unseen=0",),
 }
 """What ``trainer=fast`` is without one of its parts."""
 

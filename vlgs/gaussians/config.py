@@ -30,6 +30,9 @@ class DensifyConfig:
     """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
     prune_below: float = 0.005
     """Weight under which a Gaussian is removed; see `GaussiansConfig.prune_on`."""
+    prune_unseen: float = 0.0
+    """When densification ends, a Gaussian that fills fewer pixels than this in every training view, by the sum of its blending weights, is removed
+    (`vlgs.training.most_shown`); 0: none is. With `prune_on` as in `prune_below`."""
     prune_large: bool = True
     """Whether Gaussians above `max_scale_share` are removed, once the first opacity reset has passed."""
     max_scale_share: float = 0.1
@@ -57,6 +60,7 @@ class DensifyConfig:
             dense_share=self.dense_share,
             max_scale_share=self.max_scale_share,
         )
+        require_range("densify", 0, 10**9, prune_unseen=self.prune_unseen)
         _require_inside_unit("densify", prune_below=self.prune_below, reset_to=self.reset_to)
         if self.reset_to <= self.prune_below:
             raise ValueError(

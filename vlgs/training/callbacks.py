@@ -23,6 +23,7 @@ from vlgs.training.checkpoint import save_checkpoint
 from vlgs.training.curves import COLUMNS, csv_lines, read_rows
 from vlgs.training.learner import Learner
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.most_shown import most_shown
 from vlgs.training.pixel_error import pixel_error
 from vlgs.training.silence import silence
 from vlgs.training.state import capture
@@ -41,6 +42,10 @@ class Densification(AfterStep):
         assert isinstance(module, VLGSModule)
         densifying, done = module.densifying, module.next_step
         config = densifying.config
+        last = done == module.settings.iterations
+        if done == config.densify.stop and config.densify.prune_unseen > 0 and not last:
+            gone = most_shown(module) < config.densify.prune_unseen
+            remove(module.model.splats, module.optimizer, densifying.state, gone)
         if done >= config.densify.stop:
             return
         state, report = densifying.state, module.report
@@ -48,7 +53,7 @@ class Densification(AfterStep):
             report.cameras, report.screen_gradients, report.renders, strict=True
         ):
             state.accumulate(gradient, render.visible, camera.width, camera.height)
-        if done == module.settings.iterations:
+        if last:
             return  # no iteration would train what comes, or bring back what is made transparent
         if config.densify.densifies_at(done):
             judged = config.densify.by_error and "color" in module.step.needs

@@ -43,6 +43,7 @@ def gathered(
     weight: Float[Tensor, " n"],
     image: Float[Tensor, "h w c"],
     of_color: bool = False,
+    step: int = 1,
 ) -> Float[Tensor, "n c"]:
     """Per Gaussian the sum over pixels of its blending weight times the image.
 
@@ -52,8 +53,9 @@ def gathered(
         weight: What blends, in [0, 1].
         image: What is summed.
         of_color: In the shapes of colour, not of language.
+        step: Of the camera, where it is every `step`-th pixel of another (`SplatModel.render_values`).
     """
     values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
     with torch.enable_grad():
-        rendered = model.render_values(camera, values, weight, of_color=of_color)
+        rendered = model.render_values(camera, values, weight, step, of_color)
         return torch.autograd.grad(rendered, values, image)[0]
