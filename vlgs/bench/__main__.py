@@ -120,7 +120,8 @@ def train(parser: ArgumentParser) -> Runner:
         labels = args.recipes or (["default", "neither"] if args.quick else list(RECIPES))
         unknown = sorted(set(labels) - set(RECIPES))
         if unknown:
-            raise ValueError(f"bench: recipe must be one of {', '.join(RECIPES)}, got {unknown[0]}")
+            known = "; ".join(RECIPES)  # some names have commas
+            raise ValueError(f"bench: recipe must be one of {known}; got {unknown[0]}")
         scenes = scene_overrides(
             args.root, args.resize, args.quick, not args.no_synthetic, args.override, args.large
         )
