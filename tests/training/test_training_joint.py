@@ -21,6 +21,7 @@ from vlgs.training.build import Parts, bind, build_module
 from vlgs.training.fit import FitOptions, fit
 from vlgs.training.joint import join_levels
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.most_shown import most_shown
 from vlgs.types import Scene
 
 DENSIFY = (
@@ -296,3 +297,20 @@ def test_kept_weights_render_all_levels(scenes: list[Scene]):
             full.training_step(step, 0)
         got, want = kept.model.splats["features"].grad, full.model.splats["features"].grad
         torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-8)
+
+
+def test_what_one_level_shows_is_shown(scenes: list[Scene]):
+    module = module_of(join_levels(scenes), "indicator=per_level", "gaussians.prune_on=indicator")
+    logits = module.model.splats["indicator_logits"]
+    with torch.no_grad():
+        logits[:] = logit(1e-4)
+    assert most_shown(module).count_nonzero() == 0  # below `RasterConfig.alpha_min`
+    shown = []
+    for level in range(3):
+        with torch.no_grad():
+            logits[:] = logit(1e-4)
+            logits[:, level] = logit(0.5)
+        shown.append(most_shown(module))
+    assert shown[0].count_nonzero() > 100
+    assert torch.equal(shown[0], shown[1])
+    assert torch.equal(shown[1], shown[2])
