@@ -59,13 +59,17 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors": ("cbb48f3055c16f1d", "fcbc1c6958b88ef0", "3c63531ff24cf4fc"),
+    "data.scene=mirrors gaussians.near_share=0": (
+        "cbb48f3055c16f1d",
+        "fcbc1c6958b88ef0",
+        "3c63531ff24cf4fc",
+    ),
     "levels=joint indicator=per_level fusion=none trainer=paper": (
         "cda3757fe9b527a0",
         "3c2fbaea7010648d",
         "3c63531ff24cf4fc",
     ),
-    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2": (
+    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0": (
         "fa59105e142c0918",
         "42c26c1806e27e11",
         "361e0f7e8b0ed906",
@@ -297,7 +301,8 @@ def test_an_option_of_a_folder_of_ones_own_has_its_name_unless_ours_has_it(tmp_p
 
 def test_a_folder_of_second_maps_counts_by_its_content_and_not_by_its_place():
     def ids(*folder: str) -> tuple[str, str]:
-        config = composed("method=fmgs", *(f"stages.1.second.folder={path}" for path in folder))
+        given = (f"stages.1.second.folder={path}" for path in folder)
+        config = composed("method=fmgs", "gaussians.near_share=0", *given)
         return run_id(config, "content"), identity(config).recipe
 
     without, here, there, other = ids(), ids("here/dino"), ids("/there/dino"), ids("here/edges")

@@ -33,7 +33,7 @@ def test_an_old_file_is_told_the_new_name():
 
 
 def test_ids_have_the_old_names():
-    config = unchecked("head.weights=/x/best_ckpt.pth", "head.dim=4")
+    config = unchecked("head.weights=/x/best_ckpt.pth", "head.dim=4", "gaussians.near_share=0")
     assert run_id(config, "f") == "22d7fa10565160f3"
     assert identity(config).recipe == "cee97baba7e9d96c"
     for new, old in FORMER.items():
