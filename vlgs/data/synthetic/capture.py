@@ -174,15 +174,19 @@ def regions(
     findable = np.array([thing.masked for thing in world.things])[numbers[3]]
     place = np.concatenate([np.arange(len(thing.parts)) for thing in world.things])
 
-    def region(level: int, number: int) -> Region:
-        if level == 3:
-            return Region(world.things[number].name, "whole")
-        part, patch = (number, None) if level == 2 else divmod(number, _PATCHES)
-        word = world.things[world.thing_of_part[part]].name
-        return Region(word, f"{word}, part {place[part]}, patch {patch}")
-
     names = {
-        level: {n: region(level, n) for n in np.unique(numbers[level][findable]).tolist()}
+        level: {
+            n: _region(world, place, level, n) for n in np.unique(numbers[level][findable]).tolist()
+        }
         for level in levels
     }
     return numbers, names
+
+
+def _region(world: World, place: Int[np.ndarray, " p"], level: int, number: int) -> Region:
+    """What a region is; `place` is that of every part within its thing."""
+    if level == 3:
+        return Region(world.things[number].name, "whole")
+    part, patch = (number, None) if level == 2 else divmod(number, _PATCHES)
+    word = world.things[world.thing_of_part[part]].name
+    return Region(word, f"{word}, part {place[part]}, patch {patch}")

@@ -208,18 +208,12 @@ def _draws(
     numbers: Int[np.ndarray, " r"], owners: Mapping[int, int], shared: float, key: tuple[int, ...]
 ) -> Float[np.ndarray, "r 3"]:
     """What decides the fate of each region: numbers of its own, or those of the thing that it is of."""
-
-    def of(level: int, number: int) -> Float[np.ndarray, " 3"]:
-        return np.random.default_rng([_FATES, *key[:-1], level, number]).random(3)
-
-    def theirs(number: int) -> bool:
-        return np.random.default_rng([_SHARED, *key, number]).random() < shared
-
-    level = key[-1]
-    rows = [
-        of(_WHOLE, owners[n]) if level != _WHOLE and theirs(n) else of(level, n)
-        for n in numbers.tolist()
-    ]
+    *place, level = key
+    rows = []
+    for number in numbers.tolist():
+        own = np.random.default_rng([_SHARED, *key, number]).random() >= shared
+        decided = (level, number) if own or level == _WHOLE else (_WHOLE, owners[number])
+        rows.append(np.random.default_rng([_FATES, *place, *decided]).random(3))
     return np.stack(rows)
 
 

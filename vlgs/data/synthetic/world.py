@@ -266,19 +266,13 @@ class World:
         No ray does whose way up to there stays above or below the part, or inside of a box.
         """
         low, high = self._extents[number]
-
-        def way(axis: int) -> tuple[np.ndarray, np.ndarray]:
-            start = origin[axis] if origin.shape[1] == 1 else origin[axis].take(rays)
-            with np.errstate(invalid="ignore"):  # without a hit, along a plane: NaN, nowhere
-                end = start + best.take(rays) * direction[axis].take(rays)
-            return np.minimum(start, end), np.maximum(start, end)
-
-        first, last = way(2)
+        length = best.take(rays)
+        first, last = _way(origin[2], direction[2], rays, length)
         apart = (first > high[2] + _HAIR) | (last < low[2] - _HAIR)
         if number in self._boxes:
             inside = (first > low[2] + _HAIR) & (last < high[2] - _HAIR)
             for axis in (0, 1):
-                first, last = way(axis)
+                first, last = _way(origin[axis], direction[axis], rays, length)
                 inside &= (first > low[axis] + _HAIR) & (last < high[axis] - _HAIR)
             apart |= inside
         return ~apart
@@ -330,3 +324,16 @@ def _extent(part: Part, bound: tuple[float, float]) -> Float[np.ndarray, "2 3"]:
 
 def _is_upright_box(part: Part) -> bool:
     return isinstance(part.shape, Box) and part.rotation == Part.rotation
+
+
+def _way(
+    origin: Float[np.ndarray, " m"],
+    direction: Float[np.ndarray, " n"],
+    rays: Int[np.ndarray, " r"],
+    length: Float[np.ndarray, " r"],
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
+    """Lowest and highest coordinate of chosen rays up to a length, along one axis."""
+    start = origin if origin.shape[0] == 1 else origin.take(rays)
+    with np.errstate(invalid="ignore"):  # without a hit, along a plane: NaN, nowhere
+        end = start + length * direction.take(rays)
+    return np.minimum(start, end), np.maximum(start, end)
