@@ -70,12 +70,12 @@ def files_of_options_parsed_once() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def groups_of_options_joined_once() -> Iterator[None]:
     """Nine tenths of the time that Hydra takes for a configuration go into finding and joining the files of its groups, mostly the same ones."""
-    from hydra._internal import config_loader_impl
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal.defaults_list import create_defaults_list
 
     from vlgs.config import CONF
 
-    find, join = config_loader_impl.create_defaults_list, ConfigLoaderImpl._compose_config_from_defaults_list  # fmt: skip
+    join = ConfigLoaderImpl._compose_config_from_defaults_list
     found, kept = dict[Any, Any](), dict[str, bytes]()
 
     def of_ours_alone(repo: Any) -> bool:
@@ -86,7 +86,7 @@ def groups_of_options_joined_once() -> Iterator[None]:
 
     def find_once(repo: Any, config_name: Any, overrides_list: Any, **how: Any) -> Any:
         if not of_ours_alone(repo) or any(one.is_sweep_override() for one in overrides_list):
-            return find(repo, config_name, overrides_list, **how)
+            return create_defaults_list(repo, config_name, overrides_list, **how)
         values = [
             one
             for one in overrides_list
@@ -95,7 +95,7 @@ def groups_of_options_joined_once() -> Iterator[None]:
         groups = tuple(one.input_line for one in overrides_list if one not in values)
         key = (config_name, groups, *sorted(how.items()))
         if key not in found:
-            found[key] = find(repo, config_name, overrides_list, **how)
+            found[key] = create_defaults_list(repo, config_name, overrides_list, **how)
         return dataclasses.replace(found[key], config_overrides=values)
 
     def join_once(self: ConfigLoaderImpl, defaults: Any, repo: Any) -> Any:
@@ -107,7 +107,7 @@ def groups_of_options_joined_once() -> Iterator[None]:
         return pickle.loads(kept[key])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(config_loader_impl, "create_defaults_list", find_once)
+        patch.setattr("hydra._internal.config_loader_impl.create_defaults_list", find_once)
         patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", join_once)
         yield
 
