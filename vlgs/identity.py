@@ -82,6 +82,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.densify.share_weights": False,
     "gaussians.densify.by_error": False,
     "gaussians.densify.prune_unseen": 0,
+    "head.training.draws": 1,
     "indicator.copies": 1,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),
@@ -192,10 +193,10 @@ def _without_files(plain: Mapping[str, Any]) -> dict[str, Any]:
 
 def _counted(node: Any, key: str = "") -> dict[str, Any]:
     """Dotted keys and values of what can move a number; a class stands as its option at its own key."""
-    leaves = {former(k): v for k, v in _leaves(node, key)}
+    leaves = dict(_leaves(node, key))
+    counted = {former(k): v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
     if not key:
-        leaves["loss"] = "default"  # as the group counted while one class held all terms
-    counted = {k: v for k, v in leaves.items() if k not in AS_WITHOUT or AS_WITHOUT[k] != v}
+        counted["loss"] = "default"  # as the group counted while one class held all terms
     mended = {} if key else {name: True for name, had in MENDED.items() if had(counted)}
     return counted | mended
 

@@ -1,4 +1,5 @@
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,21 @@ def test_fit_is_a_function_of_the_data_and_leaves_the_global_generator_alone():
     assert not same(weights(first), weights(other))
 
 
+def test_of_several_draws_the_one_that_reconstructs_best_stays():
+    vectors, areas, _ = masks(cone(5), 10, seed=2)
+
+    def fitted(seed: int, draws: int = 1) -> Autoencoder:
+        head = Autoencoder(training=replace(QUICK, seed=seed, draws=draws))
+        head.fit(vectors, areas)
+        return head
+
+    alone = [fitted(seed) for seed in range(6)]
+    for first, several in ((0, fitted(0, draws=3)), (3, fitted(1, draws=3))):
+        best = max(alone[first : first + 3], key=lambda head: head.reconstruction)
+        assert same(weights(several), weights(best))
+        assert several.reconstruction == best.reconstruction
+
+
 def test_one_embedding_is_enough():
     head = Autoencoder(training=AutoencoderTraining(steps=200, batch=32))
     vector = normalize(draw(1, 64, seed=0))
@@ -255,7 +271,7 @@ def test_bad_calls():
     "options",
     [
         {"steps": 1}, {"batch": 0}, {"learning_rate": 0.0}, {"area_power": -1.0}, {"area_power": 2.5}, {"code_noise": torch.inf},
-        {"min_coverage": 0.0},
+        {"min_coverage": 0.0}, {"draws": 0}, {"seed": 2**62, "draws": 3},
     ],
 )  # fmt: skip
 def test_bad_training_settings(options: dict):

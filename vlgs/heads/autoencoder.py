@@ -50,13 +50,17 @@ class AutoencoderTraining:
     min_coverage: float = 0.5
     """Codes are shortened by a factor drawn from this to 1, as rendering does where the weights do not add up to 1."""
     seed: int = 0
+    draws: int = 1
+    """Fits that differ in their seed alone, of which the one that reconstructs best stays. One fit is a matter of luck: with 3 numbers for a code
+    another costs or gives a scene 2 to 5 points of mIoU."""
 
     def __post_init__(self) -> None:
+        require_range("autoencoder", 1, 1000, draws=self.draws)
         require_range("autoencoder", 2, 10**7, steps=self.steps)
         require_range("autoencoder", 2, 2**20, batch=self.batch)
         require_range("autoencoder", 0, 10, code_noise=self.code_noise)
         require_range("autoencoder", 0, 2, area_power=self.area_power)
-        require_range("autoencoder", 0, 2**63 - 1, seed=self.seed)
+        require_range("autoencoder", 0, 2**63 // self.draws - 1, seed=self.seed)
         if not 0.0 < self.learning_rate <= 1.0:
             raise ValueError(
                 f"autoencoder: learning_rate must be above 0 and at most 1, got {self.learning_rate}"
@@ -214,10 +218,19 @@ class Autoencoder(nn.Module):
         self.eval()
 
     def _fit(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> None:
+        first = self.fit_settings.seed * self.fit_settings.draws  # no two seeds share a draw
+        fits = (self._draw(vectors, areas, first + i) for i in range(self.fit_settings.draws))
+        _, weights = max(fits, key=lambda fit: fit[0])
+        self.load_state_dict(weights)
+
+    def _draw(
+        self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"], seed: int
+    ) -> tuple[float, dict[str, Tensor]]:
+        """One fit: its reconstruction and its weights."""
         settings = self.fit_settings
-        generator = torch.Generator().manual_seed(settings.seed)
+        generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(settings.seed)
+            torch.manual_seed(seed)
             self.build(vectors.shape[1])
         if self.center:
             self.mean = areas @ vectors / areas.sum()
@@ -238,7 +251,7 @@ class Autoencoder(nn.Module):
                 if score > best[0]:
                     best = score, {k: v.clone() for k, v in self.state_dict().items()}
         optimizer.zero_grad()  # weights that stay as they are need no room for gradients
-        self.load_state_dict(best[1])
+        return best
 
     def _loss(
         self,
