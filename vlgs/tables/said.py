@@ -112,7 +112,8 @@ def _how_to_read(filled: Filled, found: Sequence[Claim], beyond: bool, effects: 
         f"Differences are row minus {one} of the same group, paired by scene and seed. The interval is Student's t over seeds, "
         + ("on this scene alone" if scenes == 1 else f"on these {scenes} scenes")
         + f". Verdicts follow from p, which Holm's correction over all {len(judged)} differences of the table has raised, so that an "
-        "interval clear of 0 may not be enough."
+        "interval clear of 0 may not be enough. Seeds share the one fit of the autoencoder, or of another head, that a scene has: a row with "
+        "a fit of its own differs by the luck of that, too, of which the interval knows nothing (table draws)."
     ]
     if effects:
         parts.append(
