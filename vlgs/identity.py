@@ -83,6 +83,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.densify.by_error": False,
     "gaussians.densify.prune_unseen": 0,
     "head.training.draws": 1,
+    "head.training.spread": 0,
     "indicator.copies": 1,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),

@@ -157,6 +157,23 @@ def test_fit_is_a_function_of_the_data_and_leaves_the_global_generator_alone():
     assert not same(weights(first), weights(other))
 
 
+def test_no_two_classes_share_a_code_that_was_placed_apart():
+    vectors, areas, labels = masks(cone(12), 10, seed=3)
+
+    def nearest(seed: int, spread: int) -> float:
+        """Degrees between the mean codes of the two classes that are nearest; 63 is the most that twelve can have."""
+        training = AutoencoderTraining(steps=100, batch=64, seed=seed, spread=spread)
+        head = Autoencoder(encoder_widths=(64, 32), decoder_widths=(32, 64), training=training)
+        head.fit(vectors, areas)
+        codes = head.encode(vectors)
+        means = normalize(torch.stack([codes[labels == k].mean(dim=0) for k in range(12)]), dim=1)
+        cosines = means @ means.T - 3 * torch.eye(12)
+        return torch.rad2deg(torch.acos(cosines.max().clamp(-1, 1))).item()
+
+    assert max(nearest(seed, spread=0) for seed in range(4)) < 30  # 18 here, 5 to 18
+    assert min(nearest(seed, spread=48) for seed in range(4)) > 35  # 46 here, up to 54
+
+
 def test_of_several_draws_the_one_that_reconstructs_best_stays():
     vectors, areas, _ = masks(cone(5), 10, seed=2)
 
@@ -271,7 +288,7 @@ def test_bad_calls():
     "options",
     [
         {"steps": 1}, {"batch": 0}, {"learning_rate": 0.0}, {"area_power": -1.0}, {"area_power": 2.5}, {"code_noise": torch.inf},
-        {"min_coverage": 0.0}, {"draws": 0}, {"seed": 2**62, "draws": 3},
+        {"min_coverage": 0.0}, {"draws": 0}, {"seed": 2**62, "draws": 3}, {"spread": -1}, {"spread": 257},
     ],
 )  # fmt: skip
 def test_bad_training_settings(options: dict):

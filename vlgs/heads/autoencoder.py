@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 
 from vlgs.files import write_atomically
 from vlgs.heads.folded import Folded, fold_linear
+from vlgs.heads.spread import Spread
 from vlgs.heads.threads import one_thread
 from vlgs.values import require_range
 
@@ -31,6 +32,8 @@ WIDEST = 8192
 """Two layers of this width take half a gigabyte."""
 MEASURED = 8192
 """Most embeddings that a measurement uses, evenly spaced among the sorted ones. Measuring all of 81 000 would take longer than the fit."""
+SPREAD_WEIGHT = 0.3
+"""Of squared distances from the places of `AutoencoderTraining.spread` at the first step, falling to 0 at the last."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +56,13 @@ class AutoencoderTraining:
     draws: int = 1
     """Fits that differ in their seed alone, of which the one that reconstructs best stays. One fit is a matter of luck: with 3 numbers for a code
     others lie 3.6 points of mIoU apart on a scene, as a standard deviation (table ``draws`` in results/synthetic)."""
+    spread: int = 0
+    """Clusters of embeddings whose codes are placed apart on the sphere before the fit (`vlgs.heads.spread`), which begins drawn to these places and ends free;
+    0: every code finds its own place, and now and then two things share one."""
 
     def __post_init__(self) -> None:
         require_range("autoencoder", 1, 1000, draws=self.draws)
+        require_range("autoencoder", 0, 256, spread=self.spread)
         require_range("autoencoder", 2, 10**7, steps=self.steps)
         require_range("autoencoder", 2, 2**20, batch=self.batch)
         require_range("autoencoder", 0, 10, code_noise=self.code_noise)
@@ -234,6 +241,7 @@ class Autoencoder(nn.Module):
             self.build(vectors.shape[1])
         if self.center:
             self.mean = areas @ vectors / areas.sum()
+        spread = Spread(vectors, settings.spread, self.dim, seed) if settings.spread else None
         optimizer = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
@@ -243,7 +251,7 @@ class Autoencoder(nn.Module):
         best: tuple[float, dict[str, Tensor]] = (-torch.inf, {})
         for step, batch in enumerate(rows.split(settings.batch), start=1):
             optimizer.zero_grad()
-            self._loss(vectors[batch], step / settings.steps, generator).backward()
+            self._loss(vectors[batch], step / settings.steps, generator, spread).backward()
             optimizer.step()
             schedule.step()
             if step in _checked_steps(settings.steps):
@@ -258,16 +266,19 @@ class Autoencoder(nn.Module):
         vectors: Float[Tensor, "m e"],
         progress: float,
         generator: torch.Generator,
+        spread: Spread | None,
     ) -> Float[Tensor, ""]:
-        """Mean of 1 - cos over a batch whose codes are disturbed as rendering disturbs them."""
+        """Mean of 1 - cos over a batch whose codes are disturbed as rendering disturbs them, and what draws these to their places."""
         settings = self.fit_settings
         self.encoder.train()
         codes = self.encode(vectors)
         self.encoder.eval()
+        away = (codes - spread(vectors)).square().sum(dim=-1).mean() if spread else 0.0
         noise = torch.randn(codes.shape, generator=generator)
         shortening = torch.rand(len(codes), 1, generator=generator) * (1 - settings.min_coverage)
         codes = (codes + progress * settings.code_noise * noise) * (1 - progress * shortening)
-        return 1 - (self.decode(codes) * vectors).sum(dim=-1).mean()
+        lost = 1 - (self.decode(codes) * vectors).sum(dim=-1).mean()
+        return lost + SPREAD_WEIGHT * (1 - progress) * away
 
     @torch.no_grad()
     def _measure(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> float:

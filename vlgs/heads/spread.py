@@ -1,0 +1,70 @@
+"""Where the codes of a scene go before they are learnt: apart, all the more where what they stand for differs."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from vlgs.heads.clusters import clusters
+
+REACH = 0.35
+"""Distance between unit codes at which they stop to matter to each other. The noise of rendered codes is about half of that."""
+STARTS = 16
+"""Random places, of whose outcomes the best stays: what is found hardly depends on the seed then."""
+STEPS = 300
+FIRST_REACH = 3.0
+"""Times `REACH` at the first step: far neighbours are sorted out before near ones."""
+RATE = 0.1
+
+
+class Spread:
+    """Unit codes of the clusters of some embeddings, which repel each other on the sphere.
+
+    The energy of two clusters is `exp(-d^2 / 2 REACH^2)` of the distance d of their codes, times how much they differ (one minus the cosine from the mean of
+    all, at most 1) and the roots of how many embeddings both have. Its minimum is sought by Adam.
+
+    Args:
+        vectors: Unit embeddings, at least one.
+        count: Clusters.
+        dim: Code width.
+        seed: Of clusters and starts.
+    """
+
+    def __init__(self, vectors: Float[Tensor, "m e"], count: int, dim: int, seed: int) -> None:
+        self.centers = clusters(vectors, count, seed)
+        sizes = torch.bincount(self._nearest(vectors), minlength=count).float().sqrt()
+        apart = normalize(self.centers - vectors.mean(dim=0), dim=-1)
+        differ = (1 - apart @ apart.T).clamp(0, 1)
+        weights = differ * torch.outer(sizes, sizes) / sizes.sum().square()
+        self.codes = _repelled(weights, dim, torch.Generator().manual_seed(seed))
+
+    def __call__(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m d"]:
+        """Each one's code: that of its nearest cluster."""
+        return self.codes[self._nearest(vectors)]
+
+    def _nearest(self, vectors: Tensor) -> Tensor:
+        return (vectors @ self.centers.T).argmax(dim=1)
+
+
+def _repelled(
+    weights: Float[Tensor, "k k"], dim: int, generator: torch.Generator
+) -> Float[Tensor, "k d"]:
+    places = torch.randn(STARTS, len(weights), dim, generator=generator).requires_grad_()
+    optimizer = torch.optim.Adam([places], lr=RATE)
+    for step in range(STEPS):
+        left = max(0.0, 1 - 1.5 * step / STEPS)  # the last third at `REACH`
+        reach = REACH * (1 + (FIRST_REACH - 1) * left)
+        optimizer.zero_grad()
+        _energy(places, weights, reach).sum().backward()
+        optimizer.step()
+    with torch.no_grad():
+        best = _energy(places, weights, REACH).argmin()
+        return normalize(places[best], dim=-1)
+
+
+def _energy(
+    places: Float[Tensor, "s k d"], weights: Float[Tensor, "k k"], reach: float
+) -> Float[Tensor, " s"]:
+    codes = normalize(places, dim=-1)
+    squared = 2 - 2 * codes @ codes.mT
+    return (weights * torch.exp(-squared / (2 * reach**2))).sum(dim=(1, 2))
