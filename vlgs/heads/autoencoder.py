@@ -58,7 +58,7 @@ class AutoencoderTraining:
     others lie 3.6 points of mIoU apart on a scene, as a standard deviation (table ``draws`` in results/synthetic)."""
     spread: int = 0
     """Clusters of embeddings whose codes are placed apart on the sphere before the fit (`vlgs.heads.spread`), which begins drawn to these places and ends free;
-    0: every code finds its own place, and now and then two things share one."""
+    0: every code finds its own place, and now and then two things share one. With 32 fits lie 1.4 points apart, and 4 points higher on average (table ``draws``)."""
 
     def __post_init__(self) -> None:
         require_range("autoencoder", 1, 1000, draws=self.draws)

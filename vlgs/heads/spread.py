@@ -8,9 +8,9 @@ from torch.nn.functional import normalize
 from vlgs.heads.clusters import clusters
 
 REACH = 0.35
-"""Distance between unit codes at which they stop to matter to each other. The noise of rendered codes is about half of that."""
+"""Of the repulsion, as a standard deviation: a distance between unit codes, about twice the noise that rendered codes have."""
 STARTS = 16
-"""Random places, of whose outcomes the best stays: what is found hardly depends on the seed then."""
+"""Random places to begin with, of whose outcomes the best stays: with many the seed hardly matters."""
 STEPS = 300
 FIRST_REACH = 3.0
 """Times `REACH` at the first step: far neighbours are sorted out before near ones."""
