@@ -29,7 +29,7 @@ NO_GRADIENT = {
     "vlgs.gaussians.init.in_view": "a mask",
     "vlgs.gaussians.parameters.at_levels": "before training",
     "vlgs.heads.clusters.clusters": "before training",
-    "vlgs.heads.spread.Spread.__call__": "picks rows",
+    "vlgs.heads.spread.spread_codes": "before training",
     "vlgs.heads.rows.linear_gradients": "a gradient itself",
     "vlgs.heads.rows.for_error": "scales gradients",
     "vlgs.heads.lookup.LookupTable.decode": "picks rows, after training",

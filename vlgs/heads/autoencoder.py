@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 
 from vlgs.files import write_atomically
 from vlgs.heads.folded import Folded, fold_linear
-from vlgs.heads.spread import Spread
+from vlgs.heads.spread import spread_codes
 from vlgs.heads.threads import one_thread
 from vlgs.values import require_range
 
@@ -241,7 +241,9 @@ class Autoencoder(nn.Module):
             self.build(vectors.shape[1])
         if self.center:
             self.mean = areas @ vectors / areas.sum()
-        spread = Spread(vectors, settings.spread, self.dim, seed) if settings.spread else None
+        places = None
+        if settings.spread:
+            places = spread_codes(vectors, settings.spread, self.dim, seed)
         optimizer = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
@@ -251,7 +253,8 @@ class Autoencoder(nn.Module):
         best: tuple[float, dict[str, Tensor]] = (-torch.inf, {})
         for step, batch in enumerate(rows.split(settings.batch), start=1):
             optimizer.zero_grad()
-            self._loss(vectors[batch], step / settings.steps, generator, spread).backward()
+            drawn = None if places is None else places[batch]
+            self._loss(vectors[batch], drawn, step / settings.steps, generator).backward()
             optimizer.step()
             schedule.step()
             if step in _checked_steps(settings.steps):
@@ -264,16 +267,16 @@ class Autoencoder(nn.Module):
     def _loss(
         self,
         vectors: Float[Tensor, "m e"],
+        places: Float[Tensor, "m d"] | None,
         progress: float,
         generator: torch.Generator,
-        spread: Spread | None,
     ) -> Float[Tensor, ""]:
         """Mean of 1 - cos over a batch whose codes are disturbed as rendering disturbs them, and what draws these to their places."""
         settings = self.fit_settings
         self.encoder.train()
         codes = self.encode(vectors)
         self.encoder.eval()
-        away = (codes - spread(vectors)).square().sum(dim=-1).mean() if spread else 0.0
+        away = 0.0 if places is None else (codes - places).square().sum(dim=-1).mean()
         noise = torch.randn(codes.shape, generator=generator)
         shortening = torch.rand(len(codes), 1, generator=generator) * (1 - settings.min_coverage)
         codes = (codes + progress * settings.code_noise * noise) * (1 - progress * shortening)

@@ -17,8 +17,10 @@ FIRST_REACH = 3.0
 RATE = 0.1
 
 
-class Spread:
-    """Unit codes of the clusters of some embeddings, which repel each other on the sphere.
+def spread_codes(
+    vectors: Float[Tensor, "m e"], count: int, dim: int, seed: int
+) -> Float[Tensor, "m d"]:
+    """Unit codes, one for every embedding: that of its cluster, and the codes of clusters repel each other on the sphere.
 
     The energy of two clusters is `exp(-d^2 / 2 REACH^2)` of the distance d of their codes, times how much they differ (one minus the cosine from the mean of
     all, at most 1) and the roots of how many embeddings both have. Its minimum is sought by Adam.
@@ -29,21 +31,13 @@ class Spread:
         dim: Code width.
         seed: Of clusters and starts.
     """
-
-    def __init__(self, vectors: Float[Tensor, "m e"], count: int, dim: int, seed: int) -> None:
-        self.centers = clusters(vectors, count, seed)
-        sizes = torch.bincount(self._nearest(vectors), minlength=count).float().sqrt()
-        apart = normalize(self.centers - vectors.mean(dim=0), dim=-1)
-        differ = (1 - apart @ apart.T).clamp(0, 1)
-        weights = differ * torch.outer(sizes, sizes) / sizes.sum().square()
-        self.codes = _repelled(weights, dim, torch.Generator().manual_seed(seed))
-
-    def __call__(self, vectors: Float[Tensor, "m e"]) -> Float[Tensor, "m d"]:
-        """Each one's code: that of its nearest cluster."""
-        return self.codes[self._nearest(vectors)]
-
-    def _nearest(self, vectors: Tensor) -> Tensor:
-        return (vectors @ self.centers.T).argmax(dim=1)
+    centers = clusters(vectors, count, seed)
+    nearest = (vectors @ centers.T).argmax(dim=1)
+    sizes = torch.bincount(nearest, minlength=count).float().sqrt()
+    apart = normalize(centers - vectors.mean(dim=0), dim=-1)
+    differ = (1 - apart @ apart.T).clamp(0, 1)
+    weights = differ * torch.outer(sizes, sizes) / sizes.sum().square()
+    return _repelled(weights, dim, torch.Generator().manual_seed(seed))[nearest]
 
 
 def _repelled(
