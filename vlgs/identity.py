@@ -59,6 +59,9 @@ MOVES_NOTHING = frozenset(
 """Keys that cannot move a number, with all that is below them. Switches of `vlgs.skips` are not among them, though some of them move
 no bit: what they move is the time that table `skips` compares."""
 
+SAID_ELSEWHERE = frozenset({"trainer.codes_apart"})
+"""Keys that move a number through another key alone, which counts (`head.training.spread`): heads that do not read them have one id with any value."""
+
 AFTER_TRAINING = ("protocol", "query", "text")
 """Groups that are asked for nothing before the last step: runs that differ in them alone have the same models."""
 
@@ -203,7 +206,7 @@ def _counted(node: Any, key: str = "") -> dict[str, Any]:
 
 
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
-    if key in MOVES_NOTHING:
+    if key in MOVES_NOTHING or key in SAID_ELSEWHERE:
         return
     if key in GIVEN_FOLDERS:
         node = None if node is None else True  # what is in it counts

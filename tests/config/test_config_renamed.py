@@ -33,7 +33,12 @@ def test_an_old_file_is_told_the_new_name():
 
 
 def test_ids_have_the_old_names():
-    config = unchecked("head.weights=/x/best_ckpt.pth", "head.dim=4", "gaussians.near_share=0")
+    config = unchecked(
+        "head.weights=/x/best_ckpt.pth",
+        "head.dim=4",
+        "gaussians.near_share=0",
+        "trainer.codes_apart=0",
+    )
     assert run_id(config, "f") == "22d7fa10565160f3"
     assert identity(config).recipe == "cee97baba7e9d96c"
     for new, old in FORMER.items():

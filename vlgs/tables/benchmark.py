@@ -21,6 +21,7 @@ from vlgs.identity import (
     MOVES_NOTHING,
     PLACES,
     RESULTS_VERSION,
+    SAID_ELSEWHERE,
     RunIdentity,
     identity,
     moves,
@@ -259,7 +260,8 @@ def _is_row(content: Any) -> bool:
 
 def _tree_digest() -> str:
     """Content of the configuration folder, what of it counts, and version of what results mean."""
-    counts = (RESULTS_VERSION, sorted(MOVES_NOTHING), sorted(AS_WITHOUT.items()), sorted(PLACES))
+    left_out = (sorted(MOVES_NOTHING), sorted(SAID_ELSEWHERE), sorted(PLACES))
+    counts = (RESULTS_VERSION, *left_out, sorted(AS_WITHOUT.items()))
     digest = hashlib.sha256(repr(counts).encode())
     for path in sorted(CONF.rglob("*.yaml")):
         digest.update(str(path.relative_to(CONF)).encode() + b"\0" + path.read_bytes() + b"\0")

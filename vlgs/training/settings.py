@@ -104,6 +104,9 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
+    codes_apart: int = 0
+    """Clusters of embeddings whose codes an autoencoder places apart before its fit: what ``head.training.spread`` is unless given. The fit comes before the
+    training, but whether it is the paper's belongs to a budget as all else that is not (`vlgs.heads.spread`)."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
