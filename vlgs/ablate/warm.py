@@ -27,7 +27,7 @@ SHARED = (
     *("vlgs.command", "vlgs.experiment", "vlgs.prepare", "vlgs.finish", "vlgs.report.summary"),
     *("vlgs.data.synthetic", "vlgs.heads.autoencoder", "vlgs.data.scene_warnings"),
     *("matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.patheffects"),
-    *("kornia.metrics", "PIL.PngImagePlugin", "scipy.spatial", "torch._dynamo", "torch.optim"),
+    *("kornia.metrics", "PIL.PngImagePlugin", "scipy.spatial", "torch.optim"),
 )
 """Modules that every run of a sweep imports, some of them late."""
 
