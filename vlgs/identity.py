@@ -59,8 +59,8 @@ MOVES_NOTHING = frozenset(
 """Keys that cannot move a number, with all that is below them. Switches of `vlgs.skips` are not among them, though some of them move
 no bit: what they move is the time that table `skips` compares."""
 
-SAID_ELSEWHERE = frozenset({"trainer.codes_apart"})
-"""Keys that move a number through another key alone, which counts (`head.training.spread`): heads that do not read them have one id with any value."""
+SAID_ELSEWHERE = frozenset({"trainer.codes_apart", "trainer.codes_faint"})
+"""Keys that move a number through another key alone, which counts (`head.training.spread`, `faint`): heads that do not read them have one id with any value."""
 
 AFTER_TRAINING = ("protocol", "query", "text")
 """Groups that are asked for nothing before the last step: runs that differ in them alone have the same models."""
@@ -87,6 +87,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.densify.prune_unseen": 0,
     "head.training.draws": 1,
     "head.training.spread": 0,
+    "head.training.faint": 0,
     "indicator.copies": 1,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),

@@ -59,7 +59,7 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0": (
+    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0": (
         "cbb48f3055c16f1d",
         "fcbc1c6958b88ef0",
         "3c63531ff24cf4fc",
@@ -147,19 +147,25 @@ def test_every_value_that_can_move_a_number_moves_the_id_and_no_other_does(
     assert {key for key in still if not key.startswith("features.")} == {
         *MOVING_NOTHING,
         "trainer.codes_apart",
+        "trainer.codes_faint",
         *(f"data.{name}" for name in PLACES),
     }
-    still -= {"trainer.codes_apart", *(f"data.{n}" for n in PLACES)}
+    still -= {"trainer.codes_apart", "trainer.codes_faint", *(f"data.{n}" for n in PLACES)}
     assert {key for key, _ in seen if not moves(key)} == still
 
 
 def test_where_codes_go_counts_through_the_head_that_reads_it():
-    free = "trainer.codes_apart=0"
+    as_paper = ("trainer.codes_apart=0", "trainer.codes_faint=0")
     assert moves("trainer.codes_apart"), "a benchmark records it"
-    assert ids(composed()) == ids(composed(free, "head.training.spread=32"))
-    assert ids(composed()) != ids(composed(free)) == ids(composed("head.training.spread=0"))
-    assert ids(composed("method=best")) == ids(composed("method=best", free))
-    assert ids(composed("trainer=paper")) == ids(composed("trainer=paper", free))
+    assert moves("trainer.codes_faint")
+    own = ("head.training.spread=32", "head.training.faint=0.35")
+    assert ids(composed()) == ids(composed(*as_paper, *own))
+    assert ids(composed(*as_paper)) == ids(
+        composed("head.training.spread=0", "head.training.faint=0")
+    )
+    assert len({ids(composed(*given)) for given in ((), as_paper, as_paper[:1], as_paper[1:])}) == 4
+    assert ids(composed("method=best")) == ids(composed("method=best", *as_paper))
+    assert ids(composed("trainer=paper")) == ids(composed("trainer=paper", *as_paper))
 
 
 def test_what_moves_nothing_and_what_may_be_left_out_are_keys_that_are_there(
@@ -313,7 +319,13 @@ def test_an_option_of_a_folder_of_ones_own_has_its_name_unless_ours_has_it(tmp_p
 def test_a_folder_of_second_maps_counts_by_its_content_and_not_by_its_place():
     def ids(*folder: str) -> tuple[str, str]:
         given = (f"stages.1.second.folder={path}" for path in folder)
-        config = composed("method=fmgs", "gaussians.near_share=0", "trainer.codes_apart=0", *given)
+        config = composed(
+            "method=fmgs",
+            "gaussians.near_share=0",
+            "trainer.codes_apart=0",
+            "trainer.codes_faint=0",
+            *given,
+        )
         return run_id(config, "content"), identity(config).recipe
 
     without, here, there, other = ids(), ids("here/dino"), ids("/there/dino"), ids("here/edges")

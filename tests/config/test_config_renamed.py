@@ -38,6 +38,7 @@ def test_ids_have_the_old_names():
         "head.dim=4",
         "gaussians.near_share=0",
         "trainer.codes_apart=0",
+        "trainer.codes_faint=0",
     )
     assert run_id(config, "f") == "22d7fa10565160f3"
     assert identity(config).recipe == "cee97baba7e9d96c"

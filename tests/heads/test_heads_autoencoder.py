@@ -174,6 +174,34 @@ def test_no_two_classes_share_a_code_that_was_placed_apart():
     assert min(nearest(seed, spread=48) for seed in range(4)) > 35  # 46 here, up to 54
 
 
+def test_faint_codes_say_what_all_masks_have_in_common_and_long_ones_their_own():
+    vectors, areas, labels = masks(cone(12), 10, seed=3)
+    classes = normalize(torch.stack([vectors[labels == k].mean(dim=0) for k in range(12)]))
+    common = normalize(vectors.mean(dim=0), dim=0)
+    towards = normalize(draw(500, 3, seed=5))
+
+    def said(faint: float) -> tuple[float, float, float]:
+        """Least cosine of faint codes with what is common, their largest preference of one class, and the share of masks whose code finds its own."""
+        training = AutoencoderTraining(steps=200, batch=128, spread=32, faint=faint)
+        head = Autoencoder(training=training)
+        head.fit(vectors, areas)
+        decoded = head.decode(torch.cat([0 * towards[:1], 0.3 * towards]))
+        fits = decoded @ classes.T
+        preference = fits.amax(dim=1) - fits.mean(dim=1)
+        found = (head.decode(0.6 * head.encode(vectors)) @ classes.T).argmax(dim=1) == labels
+        return (
+            float((decoded @ common).min()),
+            float(preference.max()),
+            float(found.float().mean()),
+        )
+
+    agreed, preferred, found = said(0.35)
+    before = said(0.0)
+    assert agreed > 0.975 > before[0]  # 0.991, 0.923
+    assert preferred < 0.07 < 0.1 < before[1]  # 0.048, 0.145
+    assert found > 0.8
+
+
 def test_of_several_draws_the_one_that_reconstructs_best_stays():
     vectors, areas, _ = masks(cone(5), 10, seed=2)
 
@@ -288,7 +316,7 @@ def test_bad_calls():
     "options",
     [
         {"steps": 1}, {"batch": 0}, {"learning_rate": 0.0}, {"area_power": -1.0}, {"area_power": 2.5}, {"code_noise": torch.inf},
-        {"min_coverage": 0.0}, {"draws": 0}, {"seed": 2**62, "draws": 3}, {"spread": -1}, {"spread": 257},
+        {"min_coverage": 0.0}, {"draws": 0}, {"seed": 2**62, "draws": 3}, {"spread": -1}, {"spread": 257}, {"faint": -0.1}, {"faint": 1.5}, {"faint": torch.nan},
     ],
 )  # fmt: skip
 def test_bad_training_settings(options: dict):

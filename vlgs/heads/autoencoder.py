@@ -59,6 +59,9 @@ class AutoencoderTraining:
     spread: int = 0
     """Clusters of embeddings whose codes are placed apart on the sphere before the fit (`vlgs.heads.spread`), which begins drawn to these places and ends free;
     0: every code finds its own place, and now and then two things share one. With 32 fits lie 1.4 points apart, and 4 points higher on average (table ``draws``)."""
+    faint: float = 0.0
+    """Length up to which codes decode to what all masks have in common, which fits no word well: that of a pixel of which few masks say anything, or none. At 0
+    they decode to whatever lies there, now and then to one thing: a sky answered to "chrome ball". Codes of `min_coverage` and more are a thing's."""
 
     def __post_init__(self) -> None:
         require_range("autoencoder", 1, 1000, draws=self.draws)
@@ -66,6 +69,7 @@ class AutoencoderTraining:
         require_range("autoencoder", 2, 10**7, steps=self.steps)
         require_range("autoencoder", 2, 2**20, batch=self.batch)
         require_range("autoencoder", 0, 10, code_noise=self.code_noise)
+        require_range("autoencoder", 0, 1, faint=self.faint)
         require_range("autoencoder", 0, 2, area_power=self.area_power)
         require_range("autoencoder", 0, 2**63 // self.draws - 1, seed=self.seed)
         if not 0.0 < self.learning_rate <= 1.0:
@@ -241,6 +245,7 @@ class Autoencoder(nn.Module):
             self.build(vectors.shape[1])
         if self.center:
             self.mean = areas @ vectors / areas.sum()
+        common = normalize(vectors.mean(dim=0), dim=0)
         places = None
         if settings.spread:
             places = spread_codes(vectors, settings.spread, self.dim, seed)
@@ -254,7 +259,10 @@ class Autoencoder(nn.Module):
         for step, batch in enumerate(rows.split(settings.batch), start=1):
             optimizer.zero_grad()
             drawn = None if places is None else places[batch]
-            self._loss(vectors[batch], drawn, step / settings.steps, generator).backward()
+            loss = self._loss(vectors[batch], drawn, step / settings.steps, generator)
+            if settings.faint:
+                loss = loss + self._faint_loss(common, generator)
+            loss.backward()
             optimizer.step()
             schedule.step()
             if step in _checked_steps(settings.steps):
@@ -282,6 +290,15 @@ class Autoencoder(nn.Module):
         codes = (codes + progress * settings.code_noise * noise) * (1 - progress * shortening)
         lost = 1 - (self.decode(codes) * vectors).sum(dim=-1).mean()
         return lost + SPREAD_WEIGHT * (1 - progress) * away
+
+    def _faint_loss(
+        self, common: Float[Tensor, " e"], generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """Mean of 1 - cos between what all masks have in common and what faint codes decode to."""
+        settings = self.fit_settings
+        towards = torch.randn(settings.batch, self.dim, generator=generator)
+        lengths = settings.faint * torch.rand(settings.batch, 1, generator=generator)
+        return 1 - (self.decode(lengths * normalize(towards, dim=-1)) @ common).mean()
 
     @torch.no_grad()
     def _measure(self, vectors: Float[Tensor, "m e"], areas: Float[Tensor, " m"]) -> float:

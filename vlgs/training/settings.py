@@ -107,6 +107,8 @@ class TrainerConfig:
     codes_apart: int = 0
     """Clusters of embeddings whose codes an autoencoder places apart before its fit: what ``head.training.spread`` is unless given. The fit comes before the
     training, but whether it is the paper's belongs to a budget as all else that is not (`vlgs.heads.spread`)."""
+    codes_faint: float = 0.0
+    """Likewise of ``head.training.faint``."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
