@@ -59,8 +59,10 @@ MOVES_NOTHING = frozenset(
 """Keys that cannot move a number, with all that is below them. Switches of `vlgs.skips` are not among them, though some of them move
 no bit: what they move is the time that table `skips` compares."""
 
-SAID_ELSEWHERE = frozenset({"trainer.codes_apart", "trainer.codes_faint"})
-"""Keys that move a number through another key alone, which counts (`head.training.spread`, `faint`): heads that do not read them have one id with any value."""
+SAID_ELSEWHERE = frozenset(
+    f"trainer.{key}" for key in ("codes_apart", "codes_faint", "indicator_reach", "language_weight")
+)
+"""Keys that move a number through a key of another group alone, which counts: parts that do not read them have one id with any value."""
 
 AFTER_TRAINING = ("protocol", "query", "text")
 """Groups that are asked for nothing before the last step: runs that differ in them alone have the same models."""
@@ -89,6 +91,8 @@ AS_WITHOUT: Mapping[str, Any] = {
     "head.training.spread": 0,
     "head.training.faint": 0,
     "indicator.copies": 1,
+    "indicator.reach": 0,
+    "loss.language.weight": 1,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),
     **dict.fromkeys(("lift.border", "lift.alike", "lift.trial"), 0),

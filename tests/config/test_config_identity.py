@@ -20,6 +20,7 @@ from vlgs.identity import (
     AS_WITHOUT,
     MOVES_NOTHING,
     PLACES,
+    SAID_ELSEWHERE,
     given_folders,
     identity,
     moves,
@@ -59,7 +60,7 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0": (
+    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0 trainer.indicator_reach=0 trainer.language_weight=1": (
         "cbb48f3055c16f1d",
         "fcbc1c6958b88ef0",
         "3c63531ff24cf4fc",
@@ -69,7 +70,7 @@ IDS = {
         "3c2fbaea7010648d",
         "3c63531ff24cf4fc",
     ),
-    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0": (
+    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0 trainer.indicator_reach=0 trainer.language_weight=1": (
         "fa59105e142c0918",
         "42c26c1806e27e11",
         "361e0f7e8b0ed906",
@@ -146,26 +147,35 @@ def test_every_value_that_can_move_a_number_moves_the_id_and_no_other_does(
     assert len(seen) > 300
     assert {key for key in still if not key.startswith("features.")} == {
         *MOVING_NOTHING,
-        "trainer.codes_apart",
-        "trainer.codes_faint",
+        *SAID_ELSEWHERE,
         *(f"data.{name}" for name in PLACES),
     }
-    still -= {"trainer.codes_apart", "trainer.codes_faint", *(f"data.{n}" for n in PLACES)}
+    still -= {*SAID_ELSEWHERE, *(f"data.{n}" for n in PLACES)}
     assert {key for key, _ in seen if not moves(key)} == still
 
 
-def test_where_codes_go_counts_through_the_head_that_reads_it():
-    as_paper = ("trainer.codes_apart=0", "trainer.codes_faint=0")
-    assert moves("trainer.codes_apart"), "a benchmark records it"
-    assert moves("trainer.codes_faint")
-    own = ("head.training.spread=32", "head.training.faint=0.35")
-    assert ids(composed()) == ids(composed(*as_paper, *own))
-    assert ids(composed(*as_paper)) == ids(
-        composed("head.training.spread=0", "head.training.faint=0")
+AS_PAPER = (
+    *("trainer.codes_apart=0", "trainer.codes_faint=0"),
+    *("trainer.indicator_reach=0", "trainer.language_weight=1"),
+)
+"""What the recipes for everyday use have otherwise than the paper's budgets, and say for other groups."""
+
+
+def test_what_a_trainer_says_for_other_groups_counts_through_these():
+    assert {
+        f"trainer.{one.partition('=')[0].partition('.')[2]}" for one in AS_PAPER
+    } == SAID_ELSEWHERE
+    assert all(moves(key) for key in SAID_ELSEWHERE), "a benchmark records them"
+    own = (
+        *("head.training.spread=32", "head.training.faint=0.35"),
+        *("indicator.reach=10", "loss.language.weight=0.3"),
     )
-    assert len({ids(composed(*given)) for given in ((), as_paper, as_paper[:1], as_paper[1:])}) == 4
-    assert ids(composed("method=best")) == ids(composed("method=best", *as_paper))
-    assert ids(composed("trainer=paper")) == ids(composed("trainer=paper", *as_paper))
+    assert ids(composed()) == ids(composed(*AS_PAPER, *own))
+    rest = [tuple(one for one in AS_PAPER if one is not left) for left in AS_PAPER]
+    assert len({ids(composed(*given)) for given in ((), AS_PAPER, *rest)}) == 6
+    assert ids(composed("method=best")) == ids(composed("method=best", *AS_PAPER))
+    for trainer in ("paper", "benchmark", "released"):
+        assert ids(composed(f"trainer={trainer}")) == ids(composed(f"trainer={trainer}", *AS_PAPER))
 
 
 def test_what_moves_nothing_and_what_may_be_left_out_are_keys_that_are_there(
@@ -322,8 +332,7 @@ def test_a_folder_of_second_maps_counts_by_its_content_and_not_by_its_place():
         config = composed(
             "method=fmgs",
             "gaussians.near_share=0",
-            "trainer.codes_apart=0",
-            "trainer.codes_faint=0",
+            *AS_PAPER,
             *given,
         )
         return run_id(config, "content"), identity(config).recipe

@@ -6,7 +6,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from vlgs.indicator import Fixed, Learned, Opacity
+from vlgs.indicator import Fixed, Learned, Opacity, PerLevel
 from vlgs.types import Gaussians
 
 CONF = Path(__file__).parents[2] / "conf" / "indicator"
@@ -29,6 +29,31 @@ def gaussians() -> Gaussians:
 
 def test_learned_is_the_parameter(gaussians: Gaussians):
     assert Learned()(gaussians) is gaussians.indicators
+
+
+def test_what_colour_hardly_sees_says_little(gaussians: Gaussians):
+    opacities = torch.tensor([0.5, 0.1, 0.02, 0.0], requires_grad=True)
+    of_language = torch.tensor(
+        -100.0
+    ).sigmoid()  # what a Gaussian without colour has (sharing=none)
+    seen = replace(gaussians, opacities=opacities + torch.tensor([0.0, 0.0, 0.0, of_language]))
+    weight, share = Learned(reach=10.0)(seen), torch.tensor([1.0, 1.0, 0.2, 1.0])
+    torch.testing.assert_close(weight, gaussians.indicators * share)
+    weight.sum().backward()
+    assert opacities.grad is None, "language raises no opacity to be seen"
+    assert gaussians.indicators.grad is not None
+    torch.testing.assert_close(gaussians.indicators.grad, share)
+    levels = torch.rand(4, 3)
+    torch.testing.assert_close(
+        PerLevel(reach=10.0)(replace(seen, indicators=levels)), levels * share[:, None]
+    )
+
+
+@pytest.mark.parametrize("reach", [-1.0, 1e7, float("nan")])
+@pytest.mark.parametrize("kind", [Learned, PerLevel])
+def test_a_reach_below_nothing_is_refused(kind: type, reach: float):
+    with pytest.raises(ValueError, match=r"indicator: reach must be 0 to 1e\+06, got"):
+        kind(reach=reach)
 
 
 def test_opacity_is_the_very_tensor_that_colour_uses(gaussians: Gaussians):
@@ -76,7 +101,12 @@ def test_fixed_outside_the_unit_interval_is_refused(value: float):
 
 @pytest.mark.parametrize(
     ("option", "want"),
-    [("learned", Learned()), ("opacity", Opacity()), ("fixed", Fixed(1.0))],
+    [
+        ("learned", Learned()),
+        ("per_level", PerLevel()),
+        ("opacity", Opacity()),
+        ("fixed", Fixed(1.0)),
+    ],
 )
 def test_option_is_the_default_of_its_class(option: str, want: object):
     assert instantiate(OmegaConf.load(CONF / f"{option}.yaml")) == want

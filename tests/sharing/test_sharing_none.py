@@ -8,6 +8,7 @@ import torch
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
+from vlgs.indicator import Learned
 from vlgs.runs import RunFolder
 from vlgs.training.build import Parts, build_module
 from vlgs.training.fit import FitOptions, fit
@@ -38,7 +39,10 @@ def trained(scene: Scene, folder: Path, color: bool, *overrides: str) -> VLGSMod
     return module
 
 
-@pytest.mark.parametrize("indicator", ["learned", "opacity", "fixed", "fixed indicator.value=1.0"])
+@pytest.mark.parametrize(
+    "indicator",
+    ["learned", "learned indicator.reach=10.0", "opacity", "fixed", "fixed indicator.value=1.0"],
+)
 def test_the_united_model_renders_what_each_set_does(
     tiny_scene: Scene, tmp_path: Path, indicator: str
 ):
@@ -56,6 +60,9 @@ def test_the_united_model_renders_what_each_set_does(
     assert torch.equal(got.color, image)
     assert code.abs().max() > 0
     torch.testing.assert_close(got.feature, code, rtol=0, atol=1e-6)
+    if indicator == "learned":  # as it is opened again, where the configuration has a reach
+        both.indicator = Learned(reach=10.0)
+        assert torch.equal(both.render(camera).feature, got.feature)
     assert both.count == color.model.count + language.model.count
     assert all(value.isfinite().all() for value in both.splats.values())
 

@@ -57,6 +57,8 @@ def test_terms_are_sums_over_both_views(tiny_scene: Scene):
             assert all(
                 torch.equal(term, error(feature, codes, VALID, pixels)) for term in terms.values()
             )
+            halved = Language(name, pixels, weight=0.5)(step)  # pyright: ignore[reportArgumentType]
+            assert all(torch.equal(2 * halved[place], term) for place, term in terms.items())
 
 
 def test_a_blended_view_weighs_lambda_times_similarity(tiny_scene: Scene):
@@ -67,6 +69,10 @@ def test_a_blended_view_weighs_lambda_times_similarity(tiny_scene: Scene):
     plan = objective.plan(0, done.seen.pair, done.seen.targets)
     assert plan is not None
     assert plan.weight == 0.7 * module.views.similarity(*done.seen.pair)
+    objective.language.weight = 0.25
+    of_weighted = objective.plan(0, done.seen.pair, done.seen.targets)
+    assert of_weighted is not None
+    assert of_weighted.weight == 0.25 * plan.weight
     assert done.seen.log == {"blend_weight": plan.weight}
     doubled = replace(plan, weight=2 * plan.weight)
     assert torch.equal(objective.loss(doubled, done.seen), 2 * done.terms["blended"])
@@ -89,6 +95,8 @@ def test_bad_values_are_named(monkeypatch: pytest.MonkeyPatch):
         "language: error must be one of mse, l1, cos, got 'l2'",
         lambda: Language("l1", "some"):  # pyright: ignore[reportArgumentType]
         "language: pixels must be one of valid, all, got 'some'",
+        lambda: Language(weight=0.0): "language: weight must be above 0 and at most 1e[+]06, got 0",
+        lambda: Language(weight=float("nan")): "language: weight must be above 0 .*, got nan",
         lambda: BlendedView(-1.0): "blended view: weight must be 0 to 1e[+]06, got -1",
         lambda: BlendedView(float("nan")): "weight must be 0 to 1e[+]06, got nan",
     }.items():

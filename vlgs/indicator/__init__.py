@@ -22,31 +22,49 @@ class Indicator(Protocol):
         ...
 
 
+COLORLESS = 1e-30
+"""Opacity up to which a Gaussian is none of colour's: those of language alone have less (`vlgs.training.separate`)."""
+
+
 @dataclass(frozen=True)
-class Learned:
-    """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. 6)."""
+class _Trained:
+    """An indicator that is a parameter of its own.
+
+    Raises:
+        ValueError: If `reach` is outside [0, 1e6].
+    """
 
     without_color: ClassVar[bool] = True
     """It blends Gaussians that have no colour."""
+    reach: float = 0.0
+    """Above 0 a Gaussian's indicator counts times ``min(1, reach * opacity)``, which moves no opacity: what colour hardly sees says little. Language that may be
+    seen where colour sees nothing explains what views disagree about by fog of its own before every camera, as colour does without a background. 0: the paper's."""
 
-    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n"]:
-        """Return `gaussians.indicators` itself."""
-        return gaussians.indicators
+    def __post_init__(self) -> None:
+        require_range("indicator", 0, 1e6, reach=self.reach)
+
+    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
+        """Return `gaussians.indicators` itself where nothing bounds it: one for each mask level where a model has levels, [n] where it has none."""
+        if not self.reach:
+            return gaussians.indicators
+        opacities = gaussians.opacities.detach()
+        seen = (self.reach * opacities).clamp(max=1)
+        seen = torch.where(opacities > COLORLESS, seen, torch.ones_like(seen))
+        return gaussians.indicators * (seen if gaussians.indicators.dim() == 1 else seen[:, None])
 
 
 @dataclass(frozen=True)
-class PerLevel:
+class Learned(_Trained):
+    """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. 6)."""
+
+
+@dataclass(frozen=True)
+class PerLevel(_Trained):
     """A learned indicator of its own for every mask level (``levels=joint``)."""
 
     demands: ClassVar[Sequence[Demand]] = (Demand("indicator=per_level", "levels", "joint"),)
     each_level: ClassVar[bool] = True
     """A Gaussian has a parameter for every mask level."""
-    without_color: ClassVar[bool] = True
-    """It blends Gaussians that have no colour."""
-
-    def __call__(self, gaussians: Gaussians) -> Float[Tensor, " n *levels"]:
-        """Return `gaussians.indicators` itself: [n] where a model has no levels (the colour of ``sharing=none``)."""
-        return gaussians.indicators
 
 
 @dataclass(frozen=True)

@@ -6,21 +6,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vlgs.objectives.between import BlendPlan, CamerasBetween, plan_blend
-from vlgs.objectives.language import Language
+from vlgs.objectives.language import MOST, Language
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import Target
 from vlgs.values import require_range
 from vlgs.view_blend import blend_targets
-
-MOST = 1e6
-"""Upper limit of the weight, far above any useful one."""
 
 
 class BlendedView(Objective):
     """``lambda L_b``: a camera between the two real views should see a mix of their codes, judged as `Language` judges the real ones.
 
     Args:
-        weight: lambda of Eq. 12.
+        weight: lambda of Eq. 12; the weight of the run's `Language` multiplies it.
 
     Raises:
         ValueError: If the weight is negative or not finite.
@@ -66,7 +63,7 @@ class BlendedView(Objective):
         ):
             return None
         similarity = setup.views.similarity(*pair) if setup.blend.ssim else 1.0
-        weight = self.weight * similarity
+        weight = self.language.weight * self.weight * similarity
         if weight <= setup.blend_least:
             setup.counts.skip("blend_zero" if weight <= 0 else "blend_small")
             return None

@@ -18,25 +18,37 @@ from vlgs.values import require_choice
 _ERRORS = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
 
 
+MOST = 1e6
+"""Upper limit of weights, far above any useful one."""
+
+
 class Language(Objective):
     """How far the rendered codes of a view are from those of its masks (conf/README.md, D.8).
 
     Args:
         error: ``mse`` is the paper's, ``l1`` LangSplat's.
         pixels: Whether the mean is over the pixels that have a mask, or over all, as LangSplat's.
+        weight: Of all language in the loss, that of `BlendedView` included. Adam's steps of what language alone trains hardly depend on it: it is how much language
+            has to say beside colour where a Gaussian goes and how opaque it is.
 
     Raises:
-        ValueError: If there is no such error, or pixels.
+        ValueError: If there is no such error, or pixels, or the weight is not in (0, 1e6].
     """
 
     needs = frozenset({"feature"})
 
     def __init__(
-        self, error: Literal["mse", "l1", "cos"] = "mse", pixels: Pixels = "valid"
+        self,
+        error: Literal["mse", "l1", "cos"] = "mse",
+        pixels: Pixels = "valid",
+        weight: float = 1.0,
     ) -> None:
         require_choice("language", "error", error, tuple(_ERRORS))
         require_choice("language", "pixels", pixels, ("valid", "all"))
+        if not 0 < weight <= MOST:
+            raise ValueError(f"language: weight must be above 0 and at most {MOST:g}, got {weight}")
         self.error = error
+        self.weight = weight
         self.pixels: Pixels = pixels
         self.predict: Callable[[Tensor], Tensor] | None = None
         self.views: TrainingViews | None = None
@@ -54,7 +66,7 @@ class Language(Objective):
         terms: dict[str, Tensor] = {}
         error = self._of_masked if self.views is not None else self._of_map
         for place, _, feature, target in step.with_language():
-            terms[f"language {place}"] = error(feature, target)
+            terms[f"language {place}"] = self.weight * error(feature, target)
         return terms
 
     def of(

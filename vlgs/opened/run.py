@@ -33,7 +33,7 @@ _NEEDED = frozenset({"query", "text"})
 """Keys that every run has recorded, and that answers are made with."""
 
 _FREE = frozenset({"vlgs.fusion.none.NoFusion", "vlgs.indicator.Learned"})
-"""What a model may have in place of what the configuration chooses: nothing that takes an argument."""
+"""What a model may have in place of what the configuration chooses: nothing that needs an argument."""
 
 
 @dataclass(frozen=True)

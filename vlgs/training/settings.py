@@ -104,11 +104,6 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
-    codes_apart: int = 0
-    """Clusters of embeddings whose codes an autoencoder places apart before its fit: what ``head.training.spread`` is unless given. The fit comes before the
-    training, but whether it is the paper's belongs to a budget as all else that is not (`vlgs.heads.spread`)."""
-    codes_faint: float = 0.0
-    """Likewise of ``head.training.faint``."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
@@ -117,6 +112,15 @@ class TrainerConfig:
     exposure: bool = False
     """Whether every training photograph has a gain, white balance and offset of its own (`vlgs.training.exposure`)."""
     skip: SkipConfig = field(default_factory=SkipConfig)
+    codes_apart: int = 0
+    """What ``head.training.spread`` is unless given. This and the next three belong to other parts, but whether they are the paper's goes with the budget, as all else
+    that is not: those of the tables are, those for everyday use are not."""
+    codes_faint: float = 0.0
+    """What ``head.training.faint`` is unless given."""
+    indicator_reach: float = 0.0
+    """What ``indicator.reach`` is unless given, of an indicator that is trained."""
+    language_weight: float = 1.0
+    """What ``loss.language.weight`` is unless given, with ``loss=default``."""
 
     def __post_init__(self) -> None:
         require_range("trainer", 1, MOST_ITERATIONS, iterations=self.iterations)
