@@ -32,7 +32,7 @@ from vlgs.gaussians.sh import rgb_to_sh, sh_to_rgb
 from vlgs.geometry import camera_center, pose_matrix, quat_to_rotmat, rotmat_to_quat
 from vlgs.gsplat import rasterization
 from vlgs.heads.identity import Identity
-from vlgs.indicator import Learned, Opacity, PerLevel
+from vlgs.indicator import Learned, Opacity
 from vlgs.losses import (
     l1_dssim,
     masked_cosine,
@@ -327,11 +327,8 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.queries.relevancy.VocabSoftmax.__call__": lambda: (
         VocabSoftmax(), [draw(4, 3), draw(2, 3, seed=1), draw(2, 3, seed=2)]
     ),
-    "vlgs.indicator.Learned.__call__": lambda: (
+    "vlgs.indicator.Trained.__call__": lambda: (
         lambda *v: Learned()(activated(*v)), list(parameters().values())
-    ),
-    "vlgs.indicator.PerLevel.__call__": lambda: (
-        lambda *v: PerLevel()(activated(*v)), list(parameters().values())
     ),
     "vlgs.indicator.Opacity.__call__": lambda: (
         lambda *v: Opacity()(activated(*v)), list(parameters().values())

@@ -23,6 +23,8 @@ KERNELS = ("project", "blend", "fusion", "Adam")
 """Parts that are not overhead: everything else is called the rest."""
 
 OVERRIDES = (
+    "trainer.indicator_reach=0.0",
+    "trainer.language_weight=1.0",
     "data.test_views=2",
     "head.training.steps=20",
     "head.cache_dir=null",

@@ -27,7 +27,7 @@ COLORLESS = 1e-30
 
 
 @dataclass(frozen=True)
-class _Trained:
+class Trained:
     """An indicator that is a parameter of its own.
 
     Raises:
@@ -54,12 +54,12 @@ class _Trained:
 
 
 @dataclass(frozen=True)
-class Learned(_Trained):
+class Learned(Trained):
     """The smoothed semantic indicator: a parameter of its own per Gaussian (Eq. 6)."""
 
 
 @dataclass(frozen=True)
-class PerLevel(_Trained):
+class PerLevel(Trained):
     """A learned indicator of its own for every mask level (``levels=joint``)."""
 
     demands: ClassVar[Sequence[Demand]] = (Demand("indicator=per_level", "levels", "joint"),)
