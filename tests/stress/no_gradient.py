@@ -30,6 +30,7 @@ NO_GRADIENT = {
     "vlgs.gaussians.parameters.at_levels": "before training",
     "vlgs.heads.clusters.clusters": "before training",
     "vlgs.heads.spread.spread_codes": "before training",
+    "vlgs.heads.fitted_weights.read_weights": "reads a file",
     "vlgs.heads.rows.linear_gradients": "a gradient itself",
     "vlgs.heads.rows.for_error": "scales gradients",
     "vlgs.heads.lookup.LookupTable.decode": "picks rows, after training",

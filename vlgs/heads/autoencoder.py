@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,12 +11,11 @@ from typing import ClassVar
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from vlgs.files import write_atomically
+from vlgs.heads.fitted_weights import read_weights, write_weights
 from vlgs.heads.folded import Folded, fold_linear
 from vlgs.heads.spread import spread_codes
 from vlgs.heads.threads import one_thread
@@ -171,8 +170,7 @@ class Autoencoder(nn.Module):
             with one_thread():
                 self._fit(vectors, areas)
             if path is not None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(path, _to_cache(self.state_dict()))
+                write_weights(path, self.state_dict())
         self.requires_grad_(False)
 
     def rehearse(self, steps: int) -> None:
@@ -326,7 +324,7 @@ class Autoencoder(nn.Module):
 
     def _read_cache(self, path: Path, width: int) -> bool:
         try:
-            state = _from_cache(path)
+            state = read_weights(path)
             first = state.get("encoder.0.weight", torch.empty(0))
             if first.shape != (self.encoder_widths[0], width):
                 raise ValueError(f"it must take vectors of {width}, got {list(first.shape)}")
@@ -339,34 +337,6 @@ class Autoencoder(nn.Module):
             log.warning("autoencoder: cache %s is not usable, fitting again: %s", path, error)
             return False
         return True
-
-
-def _to_cache(state: Mapping[str, Tensor]) -> bytes:
-    """A file of weights that holds its digest: without it a flipped bit would go into every result, unnoticed."""
-    return save(dict(state), {"digest": _digest(state)})
-
-
-def _from_cache(path: Path) -> dict[str, Tensor]:
-    """The inverse of `_to_cache`.
-
-    Raises:
-        ValueError: If the weights are not those that were written.
-    """
-    if path.exists() and not path.is_file():  # a pipe would be waited for without end
-        raise ValueError("it is no file")
-    with path.open("rb"):  # says why a file cannot be opened
-        pass
-    with safe_open(path, framework="pt") as file:
-        digest = (file.metadata() or {}).get("digest")
-        state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no __iter__)
-    if digest != _digest(state):
-        raise ValueError("it does not match its digest")
-    return state
-
-
-def _digest(state: Mapping[str, Tensor]) -> str:
-    """Hash of names, types, shapes and values: safetensors sorts them, and without metadata equal weights are equal bytes."""
-    return hashlib.blake2b(save(dict(state)), digest_size=16).hexdigest()
 
 
 def _build_for_state(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from vlgs.demands import has
 from vlgs.fields.splat import SplatModel
 from vlgs.fusion.none import NoFusion
-from vlgs.indicator import Learned, PerLevel
+from vlgs.indicator import Learned, Trained
 from vlgs.training.build import Parts
 from vlgs.types import Scene
 
@@ -42,7 +42,7 @@ def for_language(parts: Parts) -> Parts:
         densify=replace(config.densify, reset_indicator=True),
     )
     indicator = parts.indicator if has(parts.indicator, "without_color") else Learned()
-    if isinstance(indicator, Learned | PerLevel):
+    if isinstance(indicator, Trained):
         indicator = replace(indicator, reach=0.0)  # no colour sees these Gaussians
     return replace(parts, gaussians=config, indicator=indicator)
 
