@@ -1,7 +1,14 @@
 """torch's compiler is loaded by who compiles, and by nobody else."""
 
+import importlib
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
+
+from vlgs.training.lean_dynamo import _WholeFirst
+from vlgs.training.lean_import import _Hidden
 
 TRAINED = """
 import sys
@@ -65,3 +72,15 @@ def test_a_part_of_the_compiler_loads_the_whole():
 
 def test_a_compiler_that_is_loaded_stays():
     assert said(LOADED_BEFORE) == ["True"]
+
+
+@pytest.mark.parametrize("finder", [_WholeFirst(), _Hidden(["torch"])])
+def test_other_packages_are_found_by_others(
+    finder: _WholeFirst | _Hidden, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
+    folder = tmp_path / f"without_init_{type(finder).__name__}"  # its path is no list
+    folder.mkdir()
+    (folder / "part.py").write_text("value = 3\n")
+    assert importlib.import_module(f"{folder.name}.part").value == 3

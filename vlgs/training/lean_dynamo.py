@@ -7,7 +7,7 @@ compilation (pytorch#162595). A module with these three stands for it until some
 
 import importlib.util
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
@@ -30,6 +30,7 @@ def _load(module: ModuleType) -> None:
     assert spec is not None
     assert spec.loader is not None
     module.__class__ = ModuleType
+    sys.meta_path[:] = [one for one in sys.meta_path if not isinstance(one, _WholeFirst)]
     spec.loader.exec_module(module)
 
 
@@ -37,7 +38,7 @@ class _WholeFirst(MetaPathFinder):
     """Who imports one module of the compiler has the compiler imported first, as is usual in a package."""
 
     def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+        self, fullname: str, path: Iterable[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """The module that came with the compiler, or nothing: then the finders that follow look for it."""
         whole = sys.modules.get(NAME)

@@ -18,7 +18,7 @@ class _Hidden(importlib.metadata.DistributionFinder):
         self.names = frozenset(names)
 
     def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+        self, fullname: str, path: Iterable[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """Refuse what is hidden and leave all else to the hooks that follow."""
         if fullname.partition(".")[0] in self.names:
