@@ -62,7 +62,7 @@ def test_the_united_model_renders_what_each_set_does(
     torch.testing.assert_close(got.feature, code, rtol=0, atol=1e-6)
     if indicator == "learned":  # as it is opened again, where the configuration has a reach
         both.indicator = Learned(reach=10.0)
-        assert torch.equal(both.render(camera).feature, got.feature)
+        torch.testing.assert_close(both.render(camera).feature, got.feature, rtol=0, atol=0)
     assert both.count == color.model.count + language.model.count
     assert all(value.isfinite().all() for value in both.splats.values())
 
