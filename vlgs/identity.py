@@ -60,7 +60,14 @@ MOVES_NOTHING = frozenset(
 no bit: what they move is the time that table `skips` compares."""
 
 SAID_ELSEWHERE = frozenset(
-    f"trainer.{key}" for key in ("codes_apart", "codes_faint", "indicator_reach", "language_weight")
+    f"trainer.{key}"
+    for key in (
+        "codes_apart",
+        "codes_faint",
+        "indicator_reach",
+        "language_weight",
+        "language_error",
+    )
 )
 """Keys that move a number through a key of another group alone, which counts: parts that do not read them have one id with any value."""
 
@@ -79,6 +86,7 @@ GIVEN_FOLDERS = frozenset({"query.masks", "stages.second.folder"})
 AS_WITHOUT: Mapping[str, Any] = {
     "data.faults.shared": 0,
     "gaussians.background": 0,
+    "gaussians.background_opacity": None,
     "gaussians.codes": "none",
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,

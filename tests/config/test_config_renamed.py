@@ -41,6 +41,8 @@ def test_ids_have_the_old_names():
         "trainer.codes_faint=0",
         "trainer.indicator_reach=0",
         "trainer.language_weight=1",
+        "trainer.language_error=mse",
+        "gaussians.background_opacity=null",
     )
     assert run_id(config, "f") == "22d7fa10565160f3"
     assert identity(config).recipe == "cee97baba7e9d96c"

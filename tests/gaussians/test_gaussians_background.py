@@ -91,7 +91,7 @@ def test_the_first_gaussians_stay_and_the_background_comes_after_them():
     config = GaussiansConfig(background=200)
     attributes = attributes_of(config, 3)
     first = initialise(toy, config, attributes)
-    both = with_background(first, toy, config.background, attributes)
+    both = with_background(first, toy, config, attributes)
     for name, value in both.items():
         assert len(value) == len(first[name]) + 200
         assert torch.equal(value[: len(first[name])], first[name])

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from vlgs.gaussians.attributes import Attributes
+from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.init import Cloud, parameters_of
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.types import Camera, Scene
@@ -35,7 +36,7 @@ MAX_NEAR = 1 << 14
 
 
 def with_background(
-    parameters: dict[str, Tensor], scene: Scene, count: int, attributes: Attributes
+    parameters: dict[str, Tensor], scene: Scene, config: GaussiansConfig, attributes: Attributes
 ) -> dict[str, Tensor]:
     """The first Gaussians and, behind them, round ones all around cameras and scene.
 
@@ -44,16 +45,20 @@ def with_background(
     Args:
         parameters: From `initialise`.
         scene: Its training views and sparse points.
-        count: Directions all around.
+        config: How many directions all around, and how opaque the background starts. What no training view sees stays so: at the opacity
+            of other Gaussians an unseen view that looks there is dark.
         attributes: What the Gaussians carry.
     """
-    sphere = background(scene, count)
+    sphere = background(scene, config.background)
     if len(sphere.points) == 0:
         return parameters
     middle = _cameras(scene)[0].mean(dim=0)
     # The distance of neighbours on a sphere of this many directions.
-    scales = (sphere.points - middle).norm(dim=1) * math.sqrt(4 * math.pi / count)
+    scales = (sphere.points - middle).norm(dim=1) * math.sqrt(4 * math.pi / config.background)
     behind = parameters_of(sphere, scales, attributes)
+    if config.background_opacity is not None:
+        start = torch.tensor(config.background_opacity).logit()
+        behind["opacity_logits"] = start.expand_as(behind["opacity_logits"]).clone()
     return {name: torch.cat([value, behind[name]]) for name, value in parameters.items()}
 
 

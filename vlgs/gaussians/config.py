@@ -124,6 +124,8 @@ class GaussiansConfig:
     """Random points for a scene without sparse points."""
     background: int = 1500
     """Directions all around in which a Gaussian stands behind everything (`vlgs.gaussians.background`); 0: none."""
+    background_opacity: float | None = None
+    """Opacity that it starts with; None: `init_opacity`."""
     silent_above: float = 0.7
     """Share of a Gaussian's language weight outside of masks, over the training views, above which its code is zero in the end
     (`vlgs.training.silence`); 1: none is."""
@@ -168,6 +170,8 @@ class GaussiansConfig:
         require_range("gaussians", 1, 10**7, init_points=self.init_points)
         require_range("gaussians", 1, 10**9, max_count=self.max_count)
         require_range("gaussians", 0, 10**6, background=self.background)
+        if self.background_opacity is not None:
+            _require_inside_unit("gaussians", background_opacity=self.background_opacity)
         require_range("gaussians", 0, 1, silent_above=self.silent_above, near_share=self.near_share)
         require_range("gaussians", 1, 65536, codes_kept=self.codes_kept)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)

@@ -127,7 +127,7 @@ def build_module(
         parameters = start_from(config.init, attributes)
     else:
         first = initialise(scene, config, attributes, seed)
-        parameters = with_background(first, scene, config.background, attributes)
+        parameters = with_background(first, scene, config, attributes)
     near = max(parts.raster.near, near_plane(scene, config.near_share))
     model = SplatModel(
         parameters,
