@@ -86,15 +86,19 @@ def test_no_background_stands_near_a_camera():
     assert beside.min() > 9 * scene_extent(viewmats)  # far instead
 
 
-def test_the_first_gaussians_stay_and_the_background_comes_after_them():
+@pytest.mark.parametrize(("background_opacity", "starts"), [(None, 0.1), (0.9, 0.9)])
+def test_the_first_gaussians_stay_and_the_background_comes_after_them(
+    background_opacity: float | None, starts: float
+):
     toy = scene(shell(-5.0)[:1])
-    config = GaussiansConfig(background=200)
+    config = GaussiansConfig(background=200, background_opacity=background_opacity)
     attributes = attributes_of(config, 3)
     first = initialise(toy, config, attributes)
     both = with_background(first, toy, config, attributes)
     for name, value in both.items():
         assert len(value) == len(first[name]) + 200
         assert torch.equal(value[: len(first[name])], first[name])
+    torch.testing.assert_close(both["opacity_logits"][1:].sigmoid(), torch.full((200,), starts))
     angle = both["log_scales"][1:, 0].exp() / both["means"][1:].norm(dim=1)
     assert 0.1 < angle.mean() < 0.5  # neighbours touch: 200 directions are 0.25 radians apart
 

@@ -127,6 +127,21 @@ def test_nothing_is_drawn_nearer_than_a_share_of_what_cameras_see(tiny_scene: Sc
     assert module_of(tiny_scene, "gaussians.near_share=1e-4").model.raster.near == 0.01
 
 
+def test_where_nobody_looked_a_background_that_starts_opaque_is_not_dark(tiny_scene: Scene):
+    """No photograph shows it, so that training cannot make it so."""
+
+    def covered(*overrides: str) -> float:
+        model = module_of(tiny_scene, "gaussians.background=500", *overrides).model
+        camera = tiny_scene.train[0].camera
+        back = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.viewmat
+        away, gaussians = replace(camera, viewmat=back), model.gaussians()
+        ones = torch.ones_like(gaussians.opacities)[:, None]
+        return model.render_values(away, ones, gaussians.opacities).mean().item()
+
+    assert covered("gaussians.background_opacity=null") < 0.8
+    assert covered("gaussians.background_opacity=0.9") > 0.95
+
+
 def test_air_is_cleared_in_the_end_of_what_colour_cannot_see(tiny_scene: Scene):
     module = module_of(tiny_scene, "gaussians.clear_air=true")
     camera, splats = tiny_scene.train[0].camera, module.model.splats
