@@ -266,6 +266,25 @@ def test_help_is_a_manual_and_needs_no_torch():
         assert section in done.stdout
 
 
+def test_garbage_is_looked_for_again_after_the_imports():
+    program = """
+import gc
+from vlgs.run import uncollected
+with uncollected():
+    assert not gc.isenabled()
+    import vlgs.experiment
+kept = gc.get_freeze_count()
+assert gc.isenabled() and kept > 100_000
+with uncollected():  # whoever runs a second time has garbage of their own
+    assert gc.isenabled()
+assert gc.get_freeze_count() == kept
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_multirun_makes_one_run_per_combination(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     empty = tmp_path / "elsewhere"
     empty.mkdir()

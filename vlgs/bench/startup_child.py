@@ -81,11 +81,14 @@ def main() -> None:
 
 def _import_all() -> dict[str, Any]:
     import vlgs.command
-    import vlgs.experiment
-    import vlgs.finish
-    import vlgs.heads.autoencoder
-    import vlgs.training.lightning
-    import vlgs.training.workshop  # noqa: F401
+    from vlgs.run import uncollected
+
+    with uncollected():
+        import vlgs.experiment
+        import vlgs.finish
+        import vlgs.heads.autoencoder
+        import vlgs.training.lightning
+        import vlgs.training.workshop  # noqa: F401
 
     return dict(sys.modules)
 
