@@ -91,6 +91,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.codes_kept": 4,
     "gaussians.codes_shape_grad": True,
     "gaussians.clear_air": False,
+    "gaussians.max_angle": 0,
     "gaussians.near_share": 0,
     "gaussians.densify.share_weights": False,
     "gaussians.densify.by_error": False,

@@ -43,6 +43,7 @@ def test_ids_have_the_old_names():
         "trainer.language_weight=1",
         "trainer.language_error=mse",
         "gaussians.background_opacity=null",
+        "gaussians.max_angle=0",
     )
     assert run_id(config, "f") == "22d7fa10565160f3"
     assert identity(config).recipe == "cee97baba7e9d96c"

@@ -35,6 +35,7 @@ def test_bad_densify_config(options: dict):
         {"sh_degree": 4},
         {"init_opacity": 1.0},
         {"background_opacity": 1.0},
+        {"max_angle": -0.1},
         {"max_count": 0},
         {"prune_on": "x"},
         {"densify_on": "x"},

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from vlgs.gaussians.in_air import Air, near_plane
+from vlgs.gaussians.in_air import Air, narrow, near_plane
 from vlgs.types import Camera, Scene, View
 
 NEAREST = 2.0
@@ -78,3 +78,15 @@ def test_the_camera_that_comes_nearest_says_where_it_is():
     behind = [[1.0, 0.0, -z] for z in (0.8, 0.9)]  # seen by the second camera alone
     before = [[0.0, 0.0, 2.0]] * 200
     assert near_plane(scene([*behind, *before]), 0.5) == pytest.approx(0.4)
+
+
+def test_what_reaches_the_nearest_camera_is_cut_down_and_nothing_else():
+    centers = torch.tensor([[0.0, 0.0, 0.0], [8.0, 0.0, 0.0]])
+    means = torch.tensor([[3.0, 0.0, 0.0], [6.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    scales = torch.tensor([[0.5, 1.5, 1.0], [0.1, 0.6, 0.4], [2.0, 0.01, 0.2]])
+    cut = scales.log()
+    narrow(cut, means, centers, most=1 / 3, near=0.3)
+    want = torch.tensor([[0.5, 1.0, 1.0], [0.1, 0.6, 0.4], [0.1, 0.01, 0.1]])
+    torch.testing.assert_close(cut.exp(), want)
+    as_they_were = (scales < want * 1.001) & (want < scales * 1.001)
+    assert torch.equal(cut[as_they_were], scales.log()[as_they_were])

@@ -12,7 +12,7 @@ from vlgs.fields.saved import plan_of_model
 from vlgs.gaussians.in_air import near_plane
 from vlgs.geometry import camera_center
 from vlgs.training.build import Parts, build_module
-from vlgs.training.callbacks import ClearAir
+from vlgs.training.callbacks import ClearAir, Narrow
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.settings import LearningRates, TrainerConfig
 from vlgs.types import Scene
@@ -140,6 +140,32 @@ def test_where_nobody_looked_a_background_that_starts_opaque_is_not_dark(tiny_sc
 
     assert covered("gaussians.background_opacity=null") < 0.8
     assert covered("gaussians.background_opacity=0.9") > 0.95
+
+
+def test_scales_stay_away_from_cameras_while_they_are_trained(tiny_scene: Scene):
+    module = module_of(tiny_scene, "gaussians.max_angle=0.3", "gaussians.densify.every=5")
+    model, centers = module.model, module.densifying.centers
+    with torch.no_grad():
+        model.splats["log_scales"][:50] = 3.0
+    most = 0.3 * torch.cdist(model.splats["means"].detach(), centers).amin(dim=1)
+
+    def too_large() -> int:
+        return int((model.splats["log_scales"].exp().amax(dim=1) > 1.001 * most).sum())
+
+    assert too_large() == 50
+    for done, left in ((6, 50), (10, 0)):
+        module.next_step = done
+        Narrow().after_step(module)
+        assert too_large() == left
+    with torch.no_grad():
+        model.splats["log_scales"][:50] = 3.0
+    module.next_step = module.settings.iterations
+    model.splats["log_scales"].requires_grad_(False)
+    Narrow().after_step(module)
+    assert too_large() == 50, "what is frozen stays"
+    model.splats["log_scales"].requires_grad_(True)
+    Narrow().after_step(module)
+    assert too_large() == 0
 
 
 def test_air_is_cleared_in_the_end_of_what_colour_cannot_see(tiny_scene: Scene):

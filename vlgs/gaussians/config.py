@@ -137,6 +137,8 @@ class GaussiansConfig:
     max_init_angle: float = 0.1
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
+    max_angle: float = 0.0
+    """The same for scales that are trained (`vlgs.gaussians.in_air.narrow`); 0: any."""
     max_count: int = 200_000
     """Sparse points beyond this are left out, and densification stops growing here."""
     prune_on: Literal["max", "opacity", "indicator"] = "max"
@@ -175,6 +177,7 @@ class GaussiansConfig:
         require_range("gaussians", 0, 1, silent_above=self.silent_above, near_share=self.near_share)
         require_range("gaussians", 1, 65536, codes_kept=self.codes_kept)
         _require_positive("gaussians", max_init_angle=self.max_init_angle)
+        require_range("gaussians", 0, 1e6, max_angle=self.max_angle)
         for name, options in {
             "color": ("rgb_dc", "rgb", "evaluated"),
             "init_features": ("zero", "lifted", "normal", "random"),

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vlgs.gaussians.init import MAX_COORDINATE, in_view
+from vlgs.gaussians.init import MAX_COORDINATE, distance_to_nearest, in_view
 from vlgs.geometry import camera_center
 from vlgs.types import Camera, Scene
 
@@ -44,6 +44,30 @@ class Air:
             center = camera_center(camera.viewmat).float()
             found |= in_view(means, camera) & ((means - center).norm(dim=1) < reach)
         return found
+
+
+@torch.no_grad()
+def narrow(
+    log_scales: Float[Tensor, "n 3"],
+    means: Float[Tensor, "n 3"],
+    centers: Float[Tensor, "v 3"],
+    most: float,
+    near: float,
+) -> None:
+    """Cut scales down to `most` times the distance to the nearest camera, in place; what is drawn for no camera counts as just so far as is.
+
+    Nothing holds a Gaussian back in a direction that no training view looks into: of a background 16 units away, which two views saw a pixel of, one standard deviation
+    became 12 units, and a camera between these two saw nothing else.
+
+    Args:
+        log_scales: Natural logarithms, world units.
+        means: World units.
+        centers: Of the training cameras.
+        most: Above 0; at a third, no camera is within three standard deviations.
+        near: Depth before which nothing is drawn.
+    """
+    far = distance_to_nearest(means.detach(), centers.to(means)).clamp_min(near)
+    log_scales.copy_(torch.minimum(log_scales, (most * far).log()[:, None]))
 
 
 def near_plane(scene: Scene, share: float) -> float:

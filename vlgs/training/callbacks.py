@@ -16,7 +16,7 @@ import lightning as L
 
 from vlgs.files import write_atomically
 from vlgs.gaussians import densify, remove, reset_opacity
-from vlgs.gaussians.in_air import Air
+from vlgs.gaussians.in_air import Air, narrow
 from vlgs.runs import RunFolder, stop_signals
 from vlgs.training.after_step import AfterStep, TrainedModule, own
 from vlgs.training.checkpoint import save_checkpoint
@@ -78,6 +78,28 @@ class Densification(AfterStep):
                 )  # fmt: skip
         if config.densify.resets_at(done):
             reset_opacity(module.model.splats, module.optimizer, config)
+
+
+class Narrow(AfterStep):
+    """As often as Gaussians may come and go, and after the last iteration, cut down those that reach a camera (`vlgs.gaussians.in_air.narrow`)."""
+
+    def after_step(self, module: TrainedModule) -> None:
+        """Do so when it is time, where scales are trained."""
+        assert isinstance(module, VLGSModule)
+        densifying, model, done = module.densifying, module.model, module.next_step
+        config = densifying.config
+        due = done % config.densify.every == 0 or done == module.settings.iterations
+        if not due or config.max_angle == 0:
+            return
+        for name, values in model.splats.items():
+            if model.attributes[name].role == "scale" and values.requires_grad:
+                narrow(
+                    values,
+                    model.splats["means"],
+                    densifying.centers,
+                    config.max_angle,
+                    model.raster.near,
+                )
 
 
 class ClearAir(AfterStep):

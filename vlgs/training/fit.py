@@ -21,6 +21,7 @@ from vlgs.training.callbacks import (
     CurveLog,
     Densification,
     GracefulStop,
+    Narrow,
     OwnFolder,
     ProgressLine,
     Silence,
@@ -65,6 +66,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
         StuckAlarm(module.settings.log_every),
         Densification(),
         Average(),
+        Narrow(),
         ClearAir(),
         Silence(),
     ]
