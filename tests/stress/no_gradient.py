@@ -26,7 +26,6 @@ NO_GRADIENT = {
     "vlgs.objectives.objective.StepView.with_language": "goes through what is checked",
     "vlgs.gaussians.attributes.Attribute.first": "before training",
     "vlgs.gaussians.in_air.Air.__call__": "a mask",
-    "vlgs.gaussians.in_air.narrow": "in place, after a step",
     "vlgs.gaussians.init.in_view": "a mask",
     "vlgs.gaussians.parameters.at_levels": "before training",
     "vlgs.heads.clusters.clusters": "before training",
