@@ -138,7 +138,7 @@ class GaussiansConfig:
     """Largest initial scale as a share of the distance to the nearest training camera: a lone outlier between
     the cameras and the scene would otherwise cover whole views."""
     max_angle: float = 0.0
-    """The same for scales that are trained (`vlgs.gaussians.in_air.narrow`); 0: any."""
+    """The same while scales are trained, and in the end (`vlgs.gaussians.in_air.narrow`); 0: any."""
     max_count: int = 200_000
     """Sparse points beyond this are left out, and densification stops growing here."""
     prune_on: Literal["max", "opacity", "indicator"] = "max"

@@ -54,17 +54,17 @@ def narrow(
     most: float,
     near: float,
 ) -> None:
-    """Cut scales down to `most` times the distance to the nearest camera, in place; what is drawn for no camera counts as just so far as is.
+    """Cut scales down to `most` times the distance to the nearest camera, in place.
 
-    Nothing holds a Gaussian back in a direction that no training view looks into: of a background 16 units away, which two views saw a pixel of, one standard deviation
-    became 12 units, and a camera between these two saw nothing else.
+    Nothing else holds a Gaussian back where no training view looks: of a background 16 units away, of which two views saw a pixel, one standard deviation
+    became 12 units, and a camera between the two saw nothing but it.
 
     Args:
         log_scales: Natural logarithms, world units.
         means: World units.
         centers: Of the training cameras.
         most: Above 0; at a third, no camera is within three standard deviations.
-        near: Depth before which nothing is drawn.
+        near: Depth before which nothing is drawn: what is nearer counts as that far.
     """
     far = distance_to_nearest(means.detach(), centers.to(means)).clamp_min(near)
     log_scales.copy_(torch.minimum(log_scales, (most * far).log()[:, None]))
