@@ -81,8 +81,11 @@ def test_a_blended_view_weighs_lambda_times_similarity(tiny_scene: Scene):
 def test_the_default_option_is_the_default_of_the_classes():
     loss = instantiate(composed().loss)
     assert list(loss) == ["photometric", "language", "blended_view"]
-    assert loss["photometric"].error == "l1_dssim"  # of trainer=default
-    assert (loss["language"].error, loss["language"].pixels) == (Language().error, "valid")
+    assert (loss["photometric"].error, loss["language"].error) == ("l1_dssim", "l1")  # trainer's
+    paper = instantiate(composed("trainer=paper").loss)
+    for one in (loss, paper):
+        assert one["language"].pixels == Language().pixels
+    assert (paper["photometric"].error, paper["language"].error) == ("mse", Language().error)
     assert loss["blended_view"].weight == BlendedView().weight
 
 

@@ -30,6 +30,7 @@ OVERRIDES = (
     # The paper's step: `vlgs.bench.seams` writes it out, and times stay comparable with those of before language was ours.
     "trainer.indicator_reach=0.0",
     "trainer.language_weight=1.0",
+    "trainer.language_error=mse",
 )
 
 
