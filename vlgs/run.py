@@ -1,6 +1,5 @@
 """Train a scene, ask it questions, report: `python -m vlgs.run`. `--help` is the manual."""
 
-import gc
 import logging
 import os
 import sys
@@ -17,6 +16,7 @@ from omegaconf import DictConfig
 from vlgs.arguments import command_line, take_command_line
 from vlgs.command import check_command
 from vlgs.config import CONF, check_config
+from vlgs.imports import uncollected
 from vlgs.places import tidy_sweep, write_config
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 from vlgs.tables.multirun import note_run
@@ -85,20 +85,6 @@ def _errors_in_a_line() -> Iterator[None]:
             raise
         print("stopped; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(STOPPED)
-
-
-@contextmanager
-def uncollected() -> Iterator[None]:
-    """For the first import of what a run needs: it keeps all it makes, and looking for garbage there is a tenth of its time; again in every later look, unless it is set aside."""
-    first = gc.isenabled() and "vlgs.experiment" not in sys.modules
-    if first:
-        gc.disable()
-    try:
-        yield
-    finally:
-        if first:
-            gc.freeze()
-            gc.enable()
 
 
 def run(config: DictConfig) -> int:

@@ -269,7 +269,7 @@ def test_help_is_a_manual_and_needs_no_torch():
 def test_garbage_is_looked_for_again_after_the_imports():
     program = """
 import gc
-from vlgs.run import uncollected
+from vlgs.imports import uncollected
 with uncollected():
     assert not gc.isenabled()
     import vlgs.experiment

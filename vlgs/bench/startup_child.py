@@ -81,7 +81,7 @@ def main() -> None:
 
 def _import_all() -> dict[str, Any]:
     import vlgs.command
-    from vlgs.run import uncollected
+    from vlgs.imports import uncollected
 
     with uncollected():
         import vlgs.experiment
