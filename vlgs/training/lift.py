@@ -58,5 +58,14 @@ def gathered(
     values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
     with torch.enable_grad():
         rendered = model.render_values(camera, values, weight, step, of_color)
-        # Of one number, as torch.autograd.grad imports sympy, 0.3 s of CPU, to compare the shapes of several.
-        return torch.autograd.grad((rendered * image).sum(), values)[0]
+    return sums_back(rendered, values, image)
+
+
+def sums_back(
+    rendered: Float[Tensor, "h w c"], values: Float[Tensor, "n c"], image: Float[Tensor, "h w c"]
+) -> Float[Tensor, "n c"]:
+    """Per Gaussian the sum over pixels of its weight in `rendered`, which was blended from `values`, times `image`."""
+    # The gradient of one number, as torch.autograd.grad imports sympy, 0.3 s of CPU, to compare the shapes of several.
+    with torch.enable_grad():
+        total = (rendered * image).sum()
+    return torch.autograd.grad(total, values)[0]

@@ -11,6 +11,7 @@ from vlgs.fields.splat import SplatModel
 from vlgs.gaussians.neighbors import nearest, pairs
 from vlgs.heads.threads import one_thread
 from vlgs.training.blur import blurred
+from vlgs.training.lift import sums_back
 from vlgs.training.mask_weights import MaskedView, masked_views
 from vlgs.types import Scene
 
@@ -69,7 +70,7 @@ class System:
             if wanted:
                 error = error - self._wanted(view, trust)
             error = blurred(self._over(trust, error), border)
-            total += torch.autograd.grad(image, values, error)[0]
+            total += sums_back(image, values, error)
         return total
 
     def _wanted(self, view: MaskedView, trust: Float[Tensor, "h w l"]) -> Float[Tensor, "h w c"]:

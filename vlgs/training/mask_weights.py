@@ -18,6 +18,7 @@ from vlgs.geometry import subsample_camera
 from vlgs.objectives.targets import covered
 from vlgs.ops.pixel_weights import PixelWeights, pixel_weights
 from vlgs.ops.project import project
+from vlgs.training.lift import sums_back
 from vlgs.types import Camera, Scene
 
 UNSEEN = -2
@@ -180,7 +181,7 @@ def _by_backward(
         values = weight.new_zeros(len(weight), len(numbers), requires_grad=True)
         with torch.enable_grad():
             image = model.render_values(view.camera, values, weight, view.step)
-            parts.append(torch.autograd.grad(image, values, inside)[0])
+        parts.append(sums_back(image, values, inside))
     return torch.cat(parts, dim=1)
 
 
