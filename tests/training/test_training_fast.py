@@ -1,4 +1,4 @@
-"""What ``trainer=fast`` does: small views at first, large steps that slow down; and slow colours of what fills few pixels."""
+"""What ``trainer=fast`` does: small views at first, large steps that slow down."""
 
 import gc
 import weakref
@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 from tiny_runs import TINY, composed
-from torch import Tensor
 
 from vlgs.config import instantiate
-from vlgs.gaussians.sh import sh_to_rgb
 from vlgs.objectives.targets import TrainingViews
 from vlgs.runs import RunFolder
 from vlgs.training.build import Parts, build_module
@@ -25,7 +23,6 @@ LESS = (
     "trainer.iterations=16",
     "trainer.half_size=0.5",
     "trainer.color_decay=0.1",
-    "trainer.trusted_pixels=0.5",
     "gaussians.densify={start: 2, stop: 15, every: 4, reset_every: 0}",
     "gaussians.densify.grad_threshold=1e-6",
 )
@@ -170,42 +167,3 @@ def test_best_takes_large_steps_in_a_short_budget_and_lets_its_positions_rest_as
     assert ends["default"].means_final == given.means_final
     for trainer in ("fast", "photos", "fast_photos"):
         assert ends[trainer].means_final == pytest.approx(given.means / 10), trainer
-
-
-FILLS = [0.02, 0.5, 2.0, 38.0]
-"""Pixels of a view that Gaussians fill."""
-
-
-def moved(module: VLGSModule) -> tuple[Tensor, Tensor]:
-    """How much of their rates sh0 and opacities go in the first step of Gaussians that fill `FILLS`, where the error is absolute."""
-    size, splats = module.views.scene.train[0].camera, module.model.splats
-    before = {name: value.detach().clone() for name, value in splats.items()}
-    fills = torch.zeros(module.count)
-    fills[: len(FILLS)] = torch.tensor(FILLS)
-    error = (fills[:, None] * sh_to_rgb(splats["sh0"])).sum() / (3 * size.width * size.height)
-    (error + 1e-9 * (fills * splats["opacity_logits"]).sum()).backward()
-    module.optimizer.step()
-    rates = {group["name"]: group["lr"] for group in module.optimizer.param_groups}
-    sh0, opacities = (
-        (before[name] - splats[name].detach())[: len(FILLS)] / rates[name]
-        for name in ("sh0", "opacity_logits")
-    )
-    return sh0, opacities
-
-
-def test_the_fewer_pixels_it_fills_the_slower_a_colour_is(tiny_scene: Scene):
-    sh0, opacities = moved(module_of(tiny_scene, "trainer.trusted_pixels=2.0"))
-    wanted = torch.tensor([fill / (fill + 2) for fill in FILLS])[:, None].expand_as(sh0)
-    torch.testing.assert_close(sh0, wanted, rtol=1e-3, atol=1e-4)
-    torch.testing.assert_close(opacities, torch.ones_like(opacities), rtol=1e-3, atol=0)
-
-
-def test_without_trusted_pixels_all_colours_go_as_far(tiny_scene: Scene):
-    sh0, _ = moved(module_of(tiny_scene))
-    torch.testing.assert_close(sh0, torch.ones_like(sh0), rtol=1e-3, atol=0)
-
-
-@pytest.mark.parametrize("wrong", [-1.0, float("nan"), float("inf"), 1e9])
-def test_trusted_pixels_that_cannot_be_are_refused(wrong: float):
-    with pytest.raises(ValueError, match="trainer: trusted_pixels must be"):
-        TrainerConfig(iterations=1, learning_rates=LearningRates(), trusted_pixels=wrong)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from statistics import fmean
 from typing import Any
 
 import lightning as L
@@ -14,7 +13,6 @@ from torch import Tensor, nn
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
 from vlgs.gaussians.ply import SH_COEFFICIENTS
-from vlgs.gaussians.sh import SH_C0
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
@@ -22,9 +20,6 @@ from vlgs.training.exposure import Exposure
 from vlgs.training.means import Means
 from vlgs.training.settings import TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
-
-_EPS = 1e-15
-"""3DGS's."""
 
 Rate = float | Mapping[str, float]
 """Adam's, or one for each part of a module."""
@@ -150,12 +145,7 @@ class VLGSModule(L.LightningModule):
 
     def _make_optimizer(self) -> torch.optim.Adam:
         groups = [
-            {
-                "params": [parameter],
-                "lr": self.model.attributes[name].rate,
-                "name": name,
-                "eps": self._eps(name),
-            }
+            {"params": [parameter], "lr": self.model.attributes[name].rate, "name": name}
             for name, parameter in self.model.splats.items()
             if parameter.requires_grad
         ]
@@ -167,15 +157,7 @@ class VLGSModule(L.LightningModule):
             groups += _groups(name, part, rates[name])
         if not groups:
             raise ValueError("train: trainer.freeze must leave something to train, got everything")
-        return torch.optim.Adam(groups, eps=_EPS, fused=True)
-
-    def _eps(self, name: str) -> float:
-        """Adam's: a gradient of this size is followed at half of the rate."""
-        if name != "sh0":
-            return _EPS
-        # The loss is a mean over pixels and channels, so that a pixel counts as much, whatever the size of its view.
-        sizes = [view.camera.width * view.camera.height for view in self.views.scene.train]
-        return max(_EPS, self.settings.trusted_pixels * SH_C0 / (3 * fmean(sizes)))
+        return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def set_schedule(self, step: int) -> None:
         """The rates that decay, and the degree of harmonics, of a step."""

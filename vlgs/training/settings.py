@@ -10,9 +10,6 @@ from vlgs.values import require_range
 MOST_ITERATIONS = 10**9
 """Upper limit of `iterations`, far above any useful value."""
 
-MOST_PIXELS = 1e6
-"""Upper limit of `trusted_pixels`, likewise."""
-
 _LANGUAGE = ("features", "indicator_logits")
 _COLOR = ("quats", "log_scales", "opacity_logits", "sh0", "shN")
 
@@ -108,9 +105,6 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
-    trusted_pixels: float = 0.0
-    """A Gaussian that fills fewer pixels of a view than this learns sh0 the more slowly, the fewer it fills, with an absolute error: Adam takes the same steps however small
-    a gradient is, so that what views see by its margin alone ends in any colour. 0: at its rate, as 3DGS's."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
@@ -142,7 +136,6 @@ class TrainerConfig:
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
         shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
-        require_range("trainer", 0, MOST_PIXELS, trusted_pixels=self.trusted_pixels)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
         if self.rates_for is not None:
