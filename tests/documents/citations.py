@@ -55,7 +55,7 @@ def files() -> Iterator[Path]:
     yield from (
         p for p in sorted(ROOT.glob("*.*")) if p.suffix in _SUFFIXES and p.stem != "CHANGELOG"
     )
-    yield from sorted(ROOT.glob("results/**/README.md"))
+    yield from (*sorted(ROOT.glob("results/**/README.md")), ROOT / "results/bench/tried.md")
     for folder in _CODE:
         for path in sorted((ROOT / folder).rglob("*")):
             if path.suffix in _SUFFIXES and path != Path(__file__).resolve() and path.is_file():

@@ -241,4 +241,4 @@ def _require_positive(who: str, **values: float) -> None:
 def _require_inside_unit(who: str, **values: float) -> None:
     for name, value in values.items():
         if not 0.0 < value < 1.0:
-            raise ValueError(f"{who}: {name} must be between 0 and 1, got {value}")
+            raise ValueError(f"{who}: {name} must be above 0 and below 1, got {value}")
