@@ -67,6 +67,7 @@ SAID_ELSEWHERE = frozenset(
         "indicator_reach",
         "language_weight",
         "language_error",
+        "language_support",
     )
 )
 """Keys that move a number through a key of another group alone, which counts: parts that do not read them have one id with any value."""
@@ -102,6 +103,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "indicator.copies": 1,
     "indicator.reach": 0,
     "loss.language.weight": 1,
+    "loss.language.support": 0,
     **dict.fromkeys(("loss.photometric", "loss.language", "loss.blended_view"), True),
     **dict.fromkeys(("lift.pixels", "stages.lift.pixels"), 250_000),
     **dict.fromkeys(("lift.border", "lift.alike", "lift.trial"), 0),

@@ -43,6 +43,7 @@ def test_a_recorded_configuration_is_the_run_that_it_was():
     config = composed(
         "indicator=opacity", "gaussians.background=0", "head.dim=4", "loss.language.pixels=all",
         "loss.blended_view.weight=0.5", "loss.language.weight=1.0", "loss.language.error=mse",
+        "loss.language.support=0.0",
     )  # fmt: skip
     again = as_today(OmegaConf.create(as_before(config)))
     check_targets(again, plugins=())

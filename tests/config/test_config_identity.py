@@ -60,7 +60,7 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse gaussians.background_opacity=null gaussians.max_angle=0": (
+    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse trainer.language_support=0 gaussians.background_opacity=null gaussians.max_angle=0": (
         "cbb48f3055c16f1d",
         "fcbc1c6958b88ef0",
         "3c63531ff24cf4fc",
@@ -70,7 +70,7 @@ IDS = {
         "3c2fbaea7010648d",
         "3c63531ff24cf4fc",
     ),
-    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse gaussians.background_opacity=null gaussians.max_angle=0": (
+    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse trainer.language_support=0 gaussians.background_opacity=null gaussians.max_angle=0": (
         "fa59105e142c0918",
         "42c26c1806e27e11",
         "361e0f7e8b0ed906",
@@ -157,6 +157,7 @@ def test_every_value_that_can_move_a_number_moves_the_id_and_no_other_does(
 AS_PAPER = (
     *("trainer.codes_apart=0", "trainer.codes_faint=0"),
     *("trainer.indicator_reach=0", "trainer.language_weight=1", "trainer.language_error=mse"),
+    "trainer.language_support=0",
 )
 """What the recipes for everyday use have otherwise than the paper's budgets, and say for other groups."""
 
@@ -169,10 +170,11 @@ def test_what_a_trainer_says_for_other_groups_counts_through_these():
     own = (
         *("head.training.spread=32", "head.training.faint=0.35"),
         *("indicator.reach=10", "loss.language.weight=0.3", "loss.language.error=l1"),
+        "loss.language.support=0.1",
     )
     assert ids(composed()) == ids(composed(*AS_PAPER, *own))
     rest = [tuple(one for one in AS_PAPER if one is not left) for left in AS_PAPER]
-    assert len({ids(composed(*given)) for given in ((), AS_PAPER, *rest)}) == 7
+    assert len({ids(composed(*given)) for given in ((), AS_PAPER, *rest)}) == 8
     assert ids(composed("method=best")) == ids(composed("method=best", *AS_PAPER))
     for trainer in ("paper", "benchmark", "released"):
         assert ids(composed(f"trainer={trainer}")) == ids(composed(f"trainer={trainer}", *AS_PAPER))

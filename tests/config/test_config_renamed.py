@@ -42,6 +42,7 @@ def test_ids_have_the_old_names():
         "trainer.indicator_reach=0",
         "trainer.language_weight=1",
         "trainer.language_error=mse",
+        "trainer.language_support=0",
         "gaussians.background_opacity=null",
         "gaussians.max_angle=0",
     )

@@ -31,6 +31,7 @@ OVERRIDES = (
     "trainer.indicator_reach=0.0",
     "trainer.language_weight=1.0",
     "trainer.language_error=mse",
+    "trainer.language_support=0.0",
 )
 
 

@@ -13,7 +13,7 @@ from vlgs.objectives.mapped_error import mapped_l1
 from vlgs.objectives.objective import Objective, Setup, StepView
 from vlgs.objectives.targets import Target, TrainingViews, masked_codes
 from vlgs.ops.squared_error import Pixels
-from vlgs.values import require_choice
+from vlgs.values import require_choice, require_range
 
 _ERRORS = {"mse": masked_mse, "l1": masked_l1, "cos": masked_cosine}
 
@@ -30,9 +30,11 @@ class Language(Objective):
         pixels: Whether the mean is over the pixels that have a mask, or over all, as LangSplat's.
         weight: Of all language in the loss, that of `BlendedView` included. Adam's steps of what language alone trains hardly depend on it: it is how much language
             has to say beside colour where a Gaussian goes and how opaque it is.
+        support: Masks of which other views support less than this share are left out after a fifth of the iterations
+            (`vlgs.training.mask_support`); 0: none is.
 
     Raises:
-        ValueError: If there is no such error, or pixels, or the weight is not in (0, 1e6].
+        ValueError: If there is no such error, or pixels, or the weight is not in (0, 1e6], or the support not in [0, 1].
     """
 
     needs = frozenset({"feature"})
@@ -42,13 +44,16 @@ class Language(Objective):
         error: Literal["mse", "l1", "cos"] = "mse",
         pixels: Pixels = "valid",
         weight: float = 1.0,
+        support: float = 0.0,
     ) -> None:
         require_choice("language", "error", error, tuple(_ERRORS))
         require_choice("language", "pixels", pixels, ("valid", "all"))
         if not 0 < weight <= MOST:
             raise ValueError(f"language: weight must be above 0 and at most {MOST:g}, got {weight}")
+        require_range("language", 0, 1, support=support)
         self.error = error
         self.weight = weight
+        self.support = support
         self.pixels: Pixels = pixels
         self.predict: Callable[[Tensor], Tensor] | None = None
         self.views: TrainingViews | None = None

@@ -64,6 +64,7 @@ class TrainingViews:
 
     Attributes:
         codes: Targets by mask, and the one of no mask.
+        left_out: Masks that are as if they were not there, see `leave_out`; None: none.
     """
 
     def __init__(
@@ -77,10 +78,18 @@ class TrainingViews:
         # "No mask" is -1, which indexes the last row, a zero code.
         self.codes = torch.cat([codes, torch.zeros(1, codes.shape[1])])
         self.cache = PixelCache(self._room())
+        self.left_out: Bool[Tensor, " m"] | None = None
 
     def at_half_size(self) -> "TrainingViews":
         """The same views, in the same pairs, with half their width and height."""
-        return TrainingViews(half_size(self.scene), self.codes[:-1], self.sampler, self.counts)
+        views = TrainingViews(half_size(self.scene), self.codes[:-1], self.sampler, self.counts)
+        views.left_out = self.left_out
+        return views
+
+    def leave_out(self, masks: Bool[Tensor, " m"]) -> None:
+        """From now on, the pixels of these masks have none."""
+        self.left_out = masks
+        self.cache = PixelCache(self._room())
 
     def __getitem__(self, index: int) -> Target:
         """A training view by its place in the scene."""
@@ -98,11 +107,18 @@ class TrainingViews:
         assert read is not None  # whoever asks has looked
         # With l mask levels, each pixel becomes l neighbours in its row.
         makers: Mapping[LanguageMap, Callable[[], Tensor]] = {
-            "masks": lambda: read().flatten(1),
-            "codes": lambda: self.codes_of(read()).flatten(1, -2),
-            "valid": lambda: (read() >= 0).flatten(1),
+            "masks": lambda: self._kept(read()).flatten(1),
+            "codes": lambda: self.codes_of(self._kept(read())).flatten(1, -2),
+            "valid": lambda: (self._kept(read()) >= 0).flatten(1),
         }
         return self.cache.get((index, name), makers[name])
+
+    def _kept(self, masks: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
+        if self.left_out is None:
+            return masks
+        # "No mask" is -1, which indexes the last entry.
+        gone = torch.cat([self.left_out, torch.zeros(1, dtype=torch.bool)])
+        return masks.masked_fill(gone[masks.long()], -1)
 
     def similarity(self, first: int, second: int) -> float:
         """SSIM(I1, I2), clamped at 0, computed once per pair (conf/README.md, D.12)."""

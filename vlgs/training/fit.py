@@ -29,6 +29,7 @@ from vlgs.training.callbacks import (
 )
 from vlgs.training.checkpoint import Checkpoint, keep_from, load_checkpoint
 from vlgs.training.lightning import VLGSModule
+from vlgs.training.mask_support import LeaveOut
 from vlgs.training.state import restore
 from vlgs.training.zero_gradients import StuckAlarm
 
@@ -65,6 +66,7 @@ def fit(module: VLGSModule, folder: RunFolder, options: FitOptions) -> str | Non
     changes = [
         StuckAlarm(module.settings.log_every),
         Densification(),
+        LeaveOut(),
         Average(),
         Narrow(),
         ClearAir(),

@@ -99,27 +99,48 @@ def mask_weights(
         share: What is summed of each pixel's weights; None: the weight itself, by the rasterizer's own backward pass.
         pixels: Most of a view, see `masked_views`.
     """
-    weight = model.fuse().language_weight
-    weight = weight if weight.dim() == 1 else weight[:, level].contiguous()
     masks = max(1, len(scene.mask_vectors))
     found: list[Tensor] = []
     values: list[Tensor] = []
+    weight = _blended(model, level)
     unmasked = torch.zeros_like(weight)
-    for view in masked_views(scene, level, pixels):
-        index = view.index
-        if view.covered is not None:
-            index = torch.where(view.covered | (index >= 0), index, UNSEEN)
-        numbers, local = torch.unique(index, return_inverse=True)
-        if share is None:
-            sums = _by_backward(model, view, weight, local, len(numbers))
-        else:
-            sums = _one_by_one(model, view, weight, local, len(numbers), share)
+    for numbers, sums in view_sums(model, scene, level, share, pixels):
         unmasked += sums[:, (numbers < 0) & (numbers != UNSEEN)].sum(1)
         sums[:, numbers < 0] = 0
         pairs = sums.nonzero()
         found.append(pairs[:, 0] * masks + numbers[pairs[:, 1]])
         values.append(sums[pairs[:, 0], pairs[:, 1]])
     return MaskWeights(*_sorted(found, values, masks, weight), unmasked)
+
+
+@torch.no_grad()
+def view_sums(
+    model: SplatModel,
+    scene: Scene,
+    level: int = 0,
+    share: Share | None = None,
+    pixels: int | None = None,
+) -> Iterator[tuple[Int[Tensor, " k"], Float[Tensor, "n k"]]]:
+    """Of every training view the rows of its masks, with -1 for pixels without one and `UNSEEN`, and each Gaussian's sum over the pixels of each.
+
+    Args: see `mask_weights`.
+    """
+    weight = _blended(model, level)
+    for view in masked_views(scene, level, pixels):
+        index = view.index
+        if view.covered is not None:
+            index = torch.where(view.covered | (index >= 0), index, UNSEEN)
+        numbers, local = torch.unique(index, return_inverse=True)
+        if share is None:
+            yield numbers, _by_backward(model, view, weight, local, len(numbers))
+        else:
+            yield numbers, _one_by_one(model, view, weight, local, len(numbers), share)
+
+
+def _blended(model: SplatModel, level: int) -> Float[Tensor, " n"]:
+    """The weights that blend language of one level."""
+    weight = model.fuse().language_weight
+    return weight if weight.dim() == 1 else weight[:, level].contiguous()
 
 
 def _sorted(

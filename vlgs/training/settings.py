@@ -114,7 +114,7 @@ class TrainerConfig:
     """Whether every training photograph has a gain, white balance and offset of its own (`vlgs.training.exposure`)."""
     skip: SkipConfig = field(default_factory=SkipConfig)
     codes_apart: int = 0
-    """What ``head.training.spread`` is unless given. This and the next four belong to other parts, but whether they are the paper's goes with the budget, as all else
+    """What ``head.training.spread`` is unless given. This and the next five belong to other parts, but whether they are the paper's goes with the budget, as all else
     that is not: those of the tables are, those for everyday use are not."""
     codes_faint: float = 0.0
     """What ``head.training.faint`` is unless given."""
@@ -124,6 +124,8 @@ class TrainerConfig:
     """What ``loss.language.weight`` is unless given, with ``loss=default``."""
     language_error: Literal["mse", "l1", "cos"] = "mse"
     """What ``loss.language.error`` is unless given, likewise."""
+    language_support: float = 0.0
+    """What ``loss.language.support`` is unless given, likewise."""
 
     def __post_init__(self) -> None:
         require_range("trainer", 1, MOST_ITERATIONS, iterations=self.iterations)

@@ -22,6 +22,8 @@ def capture(module: VLGSModule, meta: dict[str, Any]) -> Checkpoint:
     tensors["densify.grad_sum"] = module.densifying.state.grad_sum
     tensors["densify.count"] = module.densifying.state.count
     tensors |= {f"mean.{name}": tensor for name, tensor in module.means.state().items()}
+    if (left_out := module.views.left_out) is not None:
+        tensors["left_out"] = left_out
     own = {
         "train_seconds": module.train_seconds,
         "results_version": RESULTS_VERSION,
@@ -54,6 +56,8 @@ def restore(module: VLGSModule, checkpoint: Checkpoint) -> None:
     module.densifying.state.grad_sum = checkpoint.tensors["densify.grad_sum"]
     module.densifying.state.count = checkpoint.tensors["densify.count"]
     module.means.restore(_below(checkpoint.tensors, "mean."))
+    if "left_out" in checkpoint.tensors:
+        module.step.leave_out(checkpoint.tensors["left_out"])
     module.next_step = checkpoint.step
     module.train_seconds = float(checkpoint.meta["train_seconds"])
     module.skips.restore(checkpoint.meta.get("skips", {}))

@@ -7,7 +7,7 @@ from functools import cached_property, partial, reduce
 from statistics import fmean
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
@@ -94,6 +94,11 @@ class TrainingStep:
             for objective in self.bound.objectives.values():
                 objective.bind(self.bound)
         return self.bound.views
+
+    def leave_out(self, masks: Bool[Tensor, " m"]) -> None:
+        """Learn nothing more from these masks, in views of either size."""
+        for views in {self.setup.views, self.bound.views}:
+            views.leave_out(masks)
 
     @cached_property
     def needs(self) -> frozenset[str]:
