@@ -4,8 +4,8 @@ An encoder takes a table for a wall in one photograph of twelve. No loss over pi
 Gaussians of its own before its camera, and a view from between the cameras sees a wall on the table. All photographs together can
 tell, as soon as Gaussians are roughly where things are: of the Gaussians under a right mask, most others say the same.
 
-Things smaller than a Gaussian share theirs with what surrounds them, which outvotes them in every view. What a mask supports in its own view is less
-there, too, hence the ratio of the two.
+Things smaller than a Gaussian share theirs with what surrounds them, which outvotes them in every view. It does so in the view of the mask itself,
+too, hence the ratio of the two.
 """
 
 import logging
@@ -92,6 +92,7 @@ class _View:
     @property
     def said(self) -> Float[Tensor, "g clusters"]:
         """Weight of each cluster in its Gaussians."""
+        # Made twice rather than kept: of hundreds of large views it would be most of a gigabyte.
         return self.weight @ one_hot(self.meanings, CLUSTERS).to(self.weight)
 
     def support(
