@@ -19,6 +19,9 @@ CONF = _INSIDE if (_INSIDE / "config.yaml").is_file() else _INSIDE.parents[1] / 
 """Folder of the configuration: inside the package in an installed wheel, beside it in a checkout. What lies beside an installed
 package (``site-packages/conf``) is somebody else's."""
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""In C where PyYAML has it: every command reads all of `conf`."""
+
 OPEN = frozenset({"gaussians.attributes", "loss"})
 """Keys whose children a user names: objectives, further attributes of a Gaussian."""
 
@@ -179,7 +182,7 @@ def near(word: str, words: Collection[str]) -> list[str]:
 
 def contents(path: Path) -> dict[str, Any]:
     """Content of a file of `conf`; empty for one of comments alone."""
-    return yaml.safe_load(path.read_text()) or {}
+    return _LOADER(path.read_text()).get_single_data() or {}
 
 
 def place(path: Path) -> str:

@@ -224,10 +224,16 @@ def _draw_tile(sheet: "Axes", tile: _Tile, x: float, y: float, height: float) ->
 
 def _draw_histogram(axes: "Axes", density: Float[Tensor, " bins"]) -> None:
     """Bars in the colours of the l - o map, so that the histogram is also its scale."""
+    from matplotlib.collections import PolyCollection
+
     edges = torch.linspace(-1, 1, len(density) + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     fills = colors.diverging(centres[None])[0].float() / 255
-    axes.bar(centres.tolist(), density.tolist(), width=2 / len(centres), color=fills.tolist())
+    left, right, zero = edges[:-1], edges[1:], torch.zeros_like(density)
+    corners = torch.stack([left, zero, left, density, right, density, right, zero], dim=1)
+    # One for all bars: `axes.bar` makes a patch of each, which takes half of the picture's time.
+    bars = list(corners.view(-1, 4, 2).numpy())
+    axes.add_collection(PolyCollection(bars, facecolors=fills.tolist()))
     axes.stairs(density.numpy(), edges.numpy(), color="0.3", linewidth=0.6)
     axes.set(xlim=(-1, 1), xticks=[-1, -0.5, 0, 0.5, 1], yticks=[])
     axes.set_xlabel(f"{DIFFERENCE} over all Gaussians", labelpad=2)
