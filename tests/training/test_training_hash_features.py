@@ -86,7 +86,8 @@ def test_what_is_asked_is_the_network_at_the_means(
     )
     group = ChannelGroup(said, gaussians.opacities)
     shape = gaussians.means, gaussians.quats, gaussians.scales
-    drawn = rasterize(*shape, [group], camera.viewmat, camera.K, 48, 36).images[0]
+    view = camera.viewmat, camera.K, 48, 36
+    drawn = rasterize(*shape, [group], *view, field.splats.model.raster).images[0]
     feature = field.render(camera, frozenset({"feature"})).feature
     assert feature is not None
     torch.testing.assert_close(feature[0], drawn, rtol=1e-4, atol=1e-5)
@@ -127,7 +128,8 @@ def test_a_step_draws_half_of_a_view_and_moves_the_networks_alone(
     shape = gaussians.means, gaussians.quats, gaussians.scales
     half = resize_camera(camera, 24, 18)
     group = ChannelGroup(said, gaussians.opacities)
-    want = rasterize(*shape, [group], half.viewmat, half.K, 24, 18).images[0]
+    small = half.viewmat, half.K, 24, 18
+    want = rasterize(*shape, [group], *small, splats.raster).images[0]
     torch.testing.assert_close(view.weights.render(said[view.rows]), want, rtol=1e-4, atol=1e-5)
     cooled = learner.terms(0, generator_of(0))["language"]
     assert cooled > 0
