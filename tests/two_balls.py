@@ -28,16 +28,21 @@ _EACH = 160
 """Gaussians of a thing."""
 
 
-def opened_scene(path: Path, name: str = "two balls", own_shape: bool = False) -> OpenedRun:
+def opened_scene(
+    path: Path, name: str = "two balls", own_shape: bool = False, raster: RasterConfig | None = None
+) -> OpenedRun:
     """As `vlgs.opened.open_run` would give it.
 
     Args:
         path: Which folder it says it is.
         name: Of the scene.
         own_shape: Whether language has covariances of its own.
+        raster: Constants that it was trained with; None: those of `RasterConfig`.
     """
     model = SplatModel(
-        _gaussians(own_shape), NoFusion(), Learned(), Identity(dim=4), RasterConfig(), sh_degree=3
+        *(_gaussians(own_shape), NoFusion(), Learned(), Identity(dim=4)),
+        raster or RasterConfig(),
+        sh_degree=3,
     )
     model.requires_grad_(False)
     words = (*THINGS, HOSTILE, *LerfRelevancy().negatives)

@@ -19,7 +19,7 @@ from vlgs.export import Wanted, export
 from vlgs.opened import OpenedRun
 from vlgs.opened.answers import ask_view, gaussian_relevancy, ranges
 from vlgs.report.colors import heat_over, to_uint8
-from vlgs.types import Camera
+from vlgs.types import Camera, RasterConfig
 
 Array = np.ndarray
 
@@ -53,13 +53,21 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["one shape", "own shape"])
+KINDS = {
+    "one shape": {},
+    "own shape": {"own_shape": True},
+    "other constants": {"raster": RasterConfig(eps2d=0.1, near=3.8)},
+}
+"""How the scene of a page was trained; at 3.8 units the near plane cuts through the nearer ball."""
+
+
+@pytest.fixture(scope="module", params=KINDS.values(), ids=KINDS)
 def shown(
     request: pytest.FixtureRequest, browser: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Shown]:
     """A page with three words and a hostile one, at the size of a small window."""
     folder = tmp_path_factory.mktemp("page")
-    opened = opened_scene(folder / "run", own_shape=request.param)
+    opened = opened_scene(folder / "run", **request.param)
     export(opened, folder / "page.html", Wanted(words=[*THINGS, HOSTILE]))
     with watched(browser, 700, 480) as (page, heard):
         page.goto(f"file://{folder}/page.html")

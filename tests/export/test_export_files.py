@@ -25,6 +25,7 @@ from vlgs.formats import read_gaussians
 from vlgs.opened import OpenedRun
 from vlgs.opened.answers import ranges, select_gaussians
 from vlgs.run import run
+from vlgs.types import RasterConfig
 
 SOURCES = Path(__file__).parents[2] / "vlgs" / "export" / "page"
 
@@ -164,7 +165,7 @@ def test_only_what_answers_is_selected(opened: OpenedRun, tmp_path: Path):
 
 def test_what_nothing_draws_is_left_out_and_counted():
     params = {"means": torch.eye(3), "opacity_logits": torch.tensor([-20.0, 0, 3])}
-    kept = drawn(Content(PointCloud(params, ())))
+    kept = drawn(Content(PointCloud(params, (), RasterConfig())))
     assert kept.cloud.params["means"].equal(torch.eye(3)[1:])
     assert kept.notes == ["1 of 3 Gaussians left out, which nothing draws"]
     assert drawn(kept).notes == kept.notes
@@ -177,7 +178,7 @@ def test_most_keeps_what_is_large_opaque_and_near(opened: OpenedRun):
         "log_scales": torch.tensor([[2.0, 2, 2], [0.01, 3, 3], [10, 0.1, 0.1], [9, 9, 9]]).log(),
         "opacity_logits": torch.tensor([0.9, 0.1, 0.9, 0.9]).logit(),
     }
-    content = Content(PointCloud(params, ()))
+    content = Content(PointCloud(params, (), RasterConfig()))
     kept = most_important(content, opened, 1)
     assert kept.cloud.params["means"].equal(params["means"][:1])
     assert kept.notes == ["1 of 4 Gaussians, those with the largest opacity times area"]
@@ -191,7 +192,7 @@ def test_numbers_are_rounded_by_half_a_step_at_most(opened: OpenedRun):
     params = dict(opened.field.model.splats)  # type: ignore[attr-defined]
     params = {name: value.detach().clone() for name, value in params.items()}
     params["means"][7] = torch.tensor([500.0, -3.0, 0.25])  # one at the horizon
-    packed = pack(Content(PointCloud(params, ())), torch.zeros(3), 4.0)
+    packed = pack(Content(PointCloud(params, (), RasterConfig())), torch.zeros(3), 4.0)
     said = packed.about
     planes = torch.frombuffer(bytearray(gzip.decompress(packed.data)), dtype=torch.uint8)
     planes = planes.view(-1, said["count"]).double()

@@ -47,7 +47,7 @@ class Content:
         params = {name: value[rows] for name, value in self.cloud.params.items()}
         return replace(
             self,
-            cloud=PointCloud(params, self.cloud.notes),
+            cloud=replace(self.cloud, params=params),
             weights=[weight[rows] for weight in self.weights],
             words=[replace(word, relevancy=word.relevancy[rows]) for word in self.words],
         )
@@ -56,7 +56,7 @@ class Content:
         """The same without the spherical harmonics above a degree."""
         params = dict(self.cloud.params)
         params["shN"] = params["shN"][:, : SH_COEFFICIENTS[degree]]
-        return replace(self, cloud=PointCloud(params, self.cloud.notes))
+        return replace(self, cloud=replace(self.cloud, params=params))
 
 
 def answer(opened: OpenedRun, names: Sequence[str], level: int | None = None) -> Content:

@@ -19,7 +19,6 @@ from vlgs.geometry import camera_center
 from vlgs.opened import NamedCamera, OpenedRun
 from vlgs.opened.cameras import focus, upright
 from vlgs.report.colors import heat, to_uint8
-from vlgs.types import RasterConfig
 
 _SOURCES = Path(__file__).with_name("page")
 _SCRIPTS = ("data.js", "order.js", "camera.js", "shaders.js", "draw.js", "main.js")
@@ -44,9 +43,7 @@ def write_page(opened: OpenedRun, content: Content) -> bytes:
     eyes = camera_center(viewmats)
     center = focus(eyes, viewmats[:, 2, :3])
     packed = pack(content, center, max((eyes - center).norm(dim=1).median().item(), 1e-6))
-    constants = (
-        RasterConfig()
-    )  # a field does not tell its own, which are these unless a run sets raster.*
+    constants = content.cloud.raster
     about = packed.about | {
         "focus": center.tolist(),
         "up": upright(viewmats).tolist(),

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from vlgs.types import Camera, DepthKind
+from vlgs.types import Camera, DepthKind, RasterConfig
 from vlgs.values import require_range
 
 
@@ -79,6 +79,8 @@ class PointCloud:
     """Raw parameters by name, see `vlgs.gaussians.attributes`."""
     notes: tuple[str, ...]
     """What a file of them says of itself; the first is `vlgs.gaussians.ply.PLAIN`."""
+    raster: RasterConfig
+    """Constants with which they are drawn as they were trained."""
 
 
 @runtime_checkable

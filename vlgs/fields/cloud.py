@@ -76,7 +76,7 @@ def point_cloud(model: SplatModel, cameras: Sequence[Camera], color: bool = True
         notes.append(f"lang_*: codes after fusion{levels}; indicator*: logit of what blends them")
     else:
         notes.append("lang_*: no language was trained, all codes are zero")
-    return PointCloud(params, (PLAIN, *notes))
+    return PointCloud(params, (PLAIN, *notes), model.raster)
 
 
 def _weight_logits(model: SplatModel) -> Float[Tensor, " n *levels"]:
