@@ -29,14 +29,15 @@ def outside_the_clamp() -> RenderScene:
     return replace(s, means=means, scales=0 * s.scales + 2.5, viewmat=torch.eye(4).double())
 
 
+@pytest.mark.parametrize("eps2d", [0.3, 0.1])
 @pytest.mark.parametrize("scene", [few, outside_the_clamp])
-def test_backward_matches_finite_differences(scene: Callable[[], RenderScene]):
-    s = scene()
+def test_backward_matches_finite_differences(scene: Callable[[], RenderScene], eps2d: float):
+    s, config = scene(), replace(SMOOTH, eps2d=eps2d)
     inputs = [s.means, s.quats, s.scales, *(w * 0.9 for w in s.weights), *s.values]
 
     def images(means, quats, scales, w0, w1, f0, f1):
         groups = [ChannelGroup(f0, w0), ChannelGroup(f1, w1)]
-        out = rasterize(means, quats, scales, groups, s.viewmat, s.K, s.width, s.height, SMOOTH)
+        out = rasterize(means, quats, scales, groups, s.viewmat, s.K, s.width, s.height, config)
         return (*out.images, *out.alphas, out.mean2d)
 
     assert torch.autograd.gradcheck(images, [t.clone().requires_grad_() for t in inputs])
