@@ -61,7 +61,7 @@ KINDS = {
 """How the scene of a page was trained; at 3.8 units the near plane cuts through the nearer ball."""
 
 
-@pytest.fixture(scope="module", params=KINDS.values(), ids=KINDS)
+@pytest.fixture(scope="module", params=KINDS.values(), ids=list(KINDS))
 def shown(
     request: pytest.FixtureRequest, browser: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Shown]:

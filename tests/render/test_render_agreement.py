@@ -17,7 +17,6 @@ from torch import Tensor
 
 from vlgs.types import RasterConfig
 
-
 BLURS = (0.3, 0.1)
 """That of 3DGS and the paper, and that of everyday trainers, with which conics are up to three times as steep."""
 
