@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
 from tests.colmap_scenes import write_scene
 from vlgs.bench import unseen
@@ -14,7 +13,6 @@ from vlgs.bench.lonely import share_lonely, view_weights
 from vlgs.bench.presets import train_a_little
 from vlgs.bench.record import read_record, write_record
 from vlgs.bench.unseen import QUICK, make_tasks, summary
-from vlgs.bench.unseen_draw import draw_unseen
 from vlgs.bench.unseen_row import UnseenRow
 
 
@@ -67,18 +65,6 @@ def test_names_of_digits_come_back_as_they_were(tmp_path: Path):
     row = UnseenRow("fox", "a tenth", "default", 0, "1e5", 3, "12", 30, 27, "0110", 0.9, None, None, 0, 9, 1)  # fmt: skip
     write_record(tmp_path / "unseen.csv", [row], {})
     assert unseen._read(tmp_path / "unseen.csv") == [row]
-
-
-def test_a_picture_has_no_room_for_scores_that_photographs_do_not_have(tmp_path: Path):
-    photographs, classes = (
-        UnseenRow("fox", "a tenth", "default", 0, "1e5", 3, "12", 30, 27, "0110", 0.9, miou, None, 0, 9, 1)
-        for miou in (None, 0.8)
-    )  # fmt: skip
-    draw_unseen(tmp_path / "photographs", [photographs])
-    draw_unseen(tmp_path / "both", [photographs, replace(classes, scene="mirrors_sky")])
-    _, low = Image.open(tmp_path / "photographs.png").size
-    _, high = Image.open(tmp_path / "both.png").size
-    assert low < 0.7 * high
 
 
 def test_photographs_that_are_not_there_are_left_out(tmp_path: Path):

@@ -10,12 +10,6 @@ from vlgs.bench.unseen_row import UnseenRow
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SCORES = (
-    ("psnr", "PSNR of held-out views, dB\n(dash: worst view)"),
-    ("miou", "mIoU of held-out views"),
-)
-"""Of a row, and what its panel says."""
-
 
 def draw_unseen(stem: Path, rows: Sequence[UnseenRow]) -> None:
     """One column per scene, one panel per score; a dot per seed, a dash for its worst view, a colour per recipe."""
@@ -24,29 +18,26 @@ def draw_unseen(stem: Path, rows: Sequence[UnseenRow]) -> None:
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
     recipes = list(dict.fromkeys((row.results_version, row.recipe) for row in rows))
-    # Photographs have no classes.
-    with_classes = {row.scene for row in rows if row.miou is not None}
-    scores = SCORES if with_classes else SCORES[:1]
     with rc_context(STYLE):
-        size = 2.8 * len(scenes) + 0.6, 1.9 * len(scores) + 0.8
-        figure = Figure(figsize=size, layout="constrained")
-        panels = figure.subplots(len(scores), len(scenes), squeeze=False, sharey="row")
-        for line, (score, label) in enumerate(scores):
-            panels[line][0].set_ylabel(label)
-            for column, scene in enumerate(scenes):
-                mine = [row for row in rows if row.scene == scene]
-                _draw_panel(panels[line][column], mine, recipes, score)
-                panels[line][column].set_visible(score == "psnr" or scene in with_classes)
+        figure = Figure(figsize=(2.8 * len(scenes) + 0.6, 4.6), layout="constrained")
+        panels = figure.subplots(2, len(scenes), squeeze=False, sharey="row")
         for column, scene in enumerate(scenes):
+            mine = [row for row in rows if row.scene == scene]
+            for line, score in enumerate(("psnr", "miou")):
+                _draw_panel(panels[line][column], mine, recipes, score)
             panels[0][column].set_title(scene, fontsize=8)
+            # Photographs have no classes.
+            panels[1][column].set_visible(any(row.miou is not None for row in mine))
+        panels[0][0].set_ylabel("PSNR of held-out views, dB\n(dash: worst view)")
+        panels[1][0].set_ylabel("mIoU of held-out views")
         # One panel may lack a recipe that another has.
         entries = {}
         for panel in panels[0]:
             handles, labels = panel.get_legend_handles_labels()
             entries |= dict(zip(labels, handles, strict=True))
-        figure.legend(
-            entries.values(), entries.keys(), loc="outside upper center", ncols=len(scenes)
-        )
+        # A label is about as wide as a panel.
+        columns = len(scenes)
+        figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=columns)
         write_figure(stem, figure)
 
 
