@@ -10,9 +10,12 @@ from vlgs.bench.unseen_row import UnseenRow
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+MARKERS = "o^sD"
+"""One for each time that the colours begin again."""
+
 
 def draw_unseen(stem: Path, rows: Sequence[UnseenRow]) -> None:
-    """One column per scene, one panel per score; a dot per seed, a dash for its worst view, a colour per recipe."""
+    """One column per scene, one panel per score; a dot per seed, a dash for its worst view, a colour and a shape per recipe."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -54,9 +57,10 @@ def _draw_panel(
         x = [splits.index(row.split) + shift for row in mine]
         y = [getattr(row, score) for row in mine]
         color, label = COLORS[i % len(COLORS)], f"{recipe}, results version {version}"
+        marker = MARKERS[i // len(COLORS) % len(MARKERS)]
         shown = [(a, b) for a, b in zip(x, y, strict=True) if b is not None]
         if shown:
-            panel.scatter(*zip(*shown, strict=True), s=9, color=color, label=label)
+            panel.scatter(*zip(*shown, strict=True), s=9, color=color, marker=marker, label=label)
         if score == "psnr":
             panel.scatter(x, [row.worst for row in mine], s=40, marker="_", color=color)
     panel.set_xticks(range(len(splits)), splits)
