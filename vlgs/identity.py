@@ -96,6 +96,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.near_share": 0,
     "gaussians.densify.share_weights": False,
     "gaussians.densify.by_error": False,
+    "gaussians.densify.long_axis": False,
     "gaussians.densify.prune_unseen": 0,
     "head.training.draws": 1,
     "head.training.spread": 0,

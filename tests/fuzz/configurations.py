@@ -127,6 +127,7 @@ WRONG = (
     ("gaussians.densify=null", "densify"),
     ("gaussians.densify=[]", "densify"),
     ("gaussians.densify.prune_below=0.5", "reset_to"),
+    ("gaussians.densify={long_axis:true,share_weights:true}", "share_weights"),
     ("trainer.learning_rates=null", "learning_rates"),
     ("trainer.learning_rates.means=-1", "means"),
     ("trainer.skip=off", "skip"),

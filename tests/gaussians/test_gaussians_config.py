@@ -21,7 +21,7 @@ def test_schedule():
     "options",
     [
         {"every": 0}, {"start": -1}, {"grad_threshold": 0.0}, {"dense_share": math.nan}, {"prune_below": 1.0},
-        {"reset_to": 0.004}, {"max_scale_share": math.inf}, {"reset_every": -1},
+        {"reset_to": 0.004}, {"max_scale_share": math.inf}, {"reset_every": -1}, {"share_weights": True, "long_axis": True},
     ],
 )  # fmt: skip
 def test_bad_densify_config(options: dict):

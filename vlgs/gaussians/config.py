@@ -49,6 +49,9 @@ class DensifyConfig:
     by_error: bool = False
     """Whether those that are cloned or split are chosen by the errors of the pixels that they blend, too (`vlgs.training.pixel_error`): as many
     as reach `grad_threshold`, those of the highest mean gradient times the root of that error."""
+    long_axis: bool = False
+    """Whether whatever is to grow, small or large, becomes two side by side on its longest axis (`vlgs.gaussians.long_axis`), in the place of clones
+    and of children that are drawn at random; `dense_share` then says nothing."""
 
     def __post_init__(self) -> None:
         _require_at_least("densify", 1, every=self.every)
@@ -62,6 +65,10 @@ class DensifyConfig:
         )
         require_range("densify", 0, 10**9, prune_unseen=self.prune_unseen)
         _require_inside_unit("densify", prune_below=self.prune_below, reset_to=self.reset_to)
+        if self.long_axis and self.share_weights:
+            raise ValueError(
+                "densify: share_weights must be false with long_axis=true, where nothing is cloned, got true"
+            )
         if self.reset_to <= self.prune_below:
             raise ValueError(
                 f"densify: reset_to must be above prune_below ({self.prune_below}), or a reset kills every "

@@ -15,6 +15,7 @@ from vlgs.gaussians.config import GaussiansConfig
 from vlgs.gaussians.draws import seeded_generator
 from vlgs.gaussians.init import distance_to_nearest
 from vlgs.gaussians.logistic import logit
+from vlgs.gaussians.long_axis import halve
 from vlgs.gaussians.parameters import Parameters
 from vlgs.geometry import quat_to_rotmat
 
@@ -116,7 +117,8 @@ def densify(
 ) -> DensifyReport:
     """Clone small and split large Gaussians whose screen gradient is high, then remove the useless ones.
 
-    A Gaussian with two shapes is as large as the larger one, and its children are drawn from colour's.
+    With `DensifyConfig.long_axis` small ones are split as well. A Gaussian with two shapes is as large as the larger one, and its children
+    are drawn from colour's.
     Parameters are replaced in `params` and in the optimiser's groups of the same name; Adam's moments follow their
     Gaussian and are zero for new ones. `state` restarts at zero. The result is a function of the arguments alone.
 
@@ -147,17 +149,21 @@ def densify(
             hot = _highest(~dead & (merit > 0), merit, int(hot.sum()))
         grow = _highest(hot, merit, config.max_count - int((~dead).sum()))
         small = _largest_scale(params, attributes) <= config.densify.dense_share * extent
-        rows = _next_generation(dead, clone=grow & small, split=grow & ~small)
+        clone = grow & small & (not config.densify.long_axis)
+        rows = _next_generation(dead, clone, split=grow & ~clone)
         values = {name: value[rows.source] for name, value in params.items()}
         if config.densify.share_weights:
-            _share_weights(values, (grow & small)[rows.source], config.densify.prune_below)
-        _place_children(values, rows, seeded_generator("densify", seed, step), attributes)
+            _share_weights(values, clone[rows.source], config.densify.prune_below)
+        if config.densify.long_axis:
+            halve(values, rows.child, attributes, config.densify.prune_below)
+        else:
+            _place_children(values, rows, seeded_generator("densify", seed, step), attributes)
         kept = _not_large(values, config, extent, step, centers, attributes)
         if not kept.all():
             rows, values = rows[kept], {name: value[kept] for name, value in values.items()}
     _replace(params, optimizer, values, rows)
     state.restart(rows.source.shape[0])
-    cloned, split, count = int((grow & small).sum()), int((grow & ~small).sum()), len(rows.source)
+    cloned, split, count = int(clone.sum()), int((grow & ~clone).sum()), len(rows.source)
     pruned, refused = n + cloned + split - count, int((hot & ~grow).sum())
     return DensifyReport(cloned, split, pruned, count, refused)
 
