@@ -63,7 +63,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
     "whole views": ("trainer.half_size=0",),
     "harmonics a twentieth": (f"{_RATE}shN=2.5e-4",),
     "3DGS's densification": (
-        "gaussians.densify.share_weights=false",
+        "gaussians.densify.long_axis=false",
         "gaussians.densify.by_error=false",
     ),
     "what no view shows stays": ("gaussians.densify.prune_unseen=0",),
