@@ -45,6 +45,8 @@ def test_ids_have_the_old_names():
         "trainer.language_support=0",
         "gaussians.background_opacity=null",
         "gaussians.max_angle=0",
+        "gaussians.densify.by_error=false",
+        "gaussians.densify.long_axis=false",
         "raster.eps2d=0.3",
     )
     assert run_id(config, "f") == "22d7fa10565160f3"
