@@ -94,7 +94,8 @@ def test_resume_is_bit_identical_to_never_having_stopped(
     assert_same_bits(whole, second)
 
 
-CHOSEN = ("gaussians.densify.share_weights=true", "gaussians.densify.by_error=true")
+CHOSEN = ("gaussians.densify.long_axis=true", "gaussians.densify.by_error=true")
+"""How everyday trainers densify."""
 
 
 @pytest.mark.parametrize("stop", [3, 9])  # 3: small views; 9: whole ones
@@ -340,7 +341,7 @@ def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
         ["sharing=pos", "gaussians.densify.reset_indicator=true", "indicator=opacity"],
         ["sharing=pos", "indicator=opacity", *CHOSEN],
         ["gaussians.color=evaluated", "trainer.exposure=true", *CHOSEN],
-        ["gaussians.densify_on=rgb", "gaussians.background=0", *CHOSEN],
+        ["gaussians.densify.share_weights=true", "gaussians.background=0", CHOSEN[1]],
     ],
     ids=" ".join,
 )
