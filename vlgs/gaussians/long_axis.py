@@ -20,7 +20,7 @@ ALONG, ACROSS = 0.6, 0.85
 OFFSET = math.sqrt(1 - ALONG**2)
 """Of a half's centre from the whole's, in standard deviations of it: both together vary on that axis as the whole does."""
 WEIGHT = 0.6
-"""Opacity of a half in that of the whole; at a whole one nothing is won. The indicator stays: lowered as well, it answered no better
+"""Opacity of a half in that of the whole; at a whole one less is won. The indicator stays: lowered as well, it answered no better
 (results/bench/tried.md)."""
 
 
