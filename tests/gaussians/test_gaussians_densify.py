@@ -2,12 +2,27 @@ import math
 
 import pytest
 import torch
+from densified import (
+    COLD,
+    EARLY,
+    EXTENT,
+    HOT,
+    LARGE,
+    LATE,
+    MIDDLE,
+    PARAMETERS,
+    SMALL,
+    adam,
+    make,
+    run,
+    state_of,
+    step_once,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
 from vlgs.gaussians import (
-    STANDARD,
     DensifyConfig,
     DensifyReport,
     DensifyState,
@@ -19,57 +34,7 @@ from vlgs.gaussians import (
 )
 from vlgs.geometry import quat_to_rotmat
 
-PARAMETERS = tuple(STANDARD)[:8]
-"""What every training has."""
-
-EXTENT = 1.0
-SMALL, MIDDLE, LARGE = 0.005, 0.05, 0.5
-EARLY, LATE = 600, 3100  # before and after the first reset
-LONG_AXIS = GaussiansConfig(densify=DensifyConfig(long_axis=True))
 ADAM = [{"foreach": False}, {"foreach": True}, {"fused": True}]
-
-
-def make(n: int, scale: float = SMALL, opacity: float = 0.5, indicator: float = 0.5):
-    generator = torch.Generator().manual_seed(n)
-    logit = lambda p: math.log(p / (1 - p))  # noqa: E731
-    values = {
-        "means": torch.randn(n, 3, generator=generator),
-        "quats": torch.randn(n, 4, generator=generator),
-        "log_scales": torch.full((n, 3), math.log(scale)),
-        "sh0": torch.randn(n, 3, generator=generator),
-        "shN": torch.randn(n, 3, 3, generator=generator),
-        "opacity_logits": torch.full((n,), logit(opacity)),
-        "indicator_logits": torch.full((n,), logit(indicator)),
-        "features": torch.randn(n, 2, generator=generator),
-    }
-    return nn.ParameterDict({name: nn.Parameter(values[name]) for name in PARAMETERS})
-
-
-def adam(params: nn.ParameterDict, **options) -> torch.optim.Adam:
-    groups = [{"params": [params[name]], "name": name, "lr": 1e-3} for name in PARAMETERS]
-    return torch.optim.Adam(groups, **options)
-
-
-def step_once(params: nn.ParameterDict, optimizer: torch.optim.Adam) -> None:
-    """One step with a gradient of its own for every row, so that a moment tells whose it is."""
-    for value in params.values():
-        rows = torch.arange(1.0, len(value) + 1).reshape(-1, *[1] * (value.dim() - 1))
-        value.grad = rows.expand_as(value).clone()
-    optimizer.step()
-    optimizer.zero_grad(set_to_none=True)
-
-
-def state_of(grads: list[float]) -> DensifyState:
-    return DensifyState(torch.tensor(grads), torch.ones(len(grads)))
-
-
-def run(params, state, config=None, optimizer=None, step=EARLY, seed=0) -> DensifyReport:
-    optimizer = adam(params) if optimizer is None else optimizer
-    config = GaussiansConfig() if config is None else config
-    return densify(params, optimizer, state, config, EXTENT, seed, step)
-
-
-HOT, COLD = 1e-3, 1e-5
 
 
 def test_statistic_is_the_mean_length_over_views_in_ndc():
@@ -189,67 +154,6 @@ def test_split_replaces_the_parent_by_two_smaller_ones_drawn_from_it():
     torch.testing.assert_close(local.T.cov(), torch.eye(3), rtol=0, atol=0.08)
     torch.testing.assert_close(local.mean(0), torch.zeros(3), rtol=0, atol=0.08)
     assert torch.equal(params["features"][:n], params["features"][n:])
-
-
-@given(
-    turn=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
-        lambda q: sum(map(abs, q)) > 0.1
-    ),
-    log_scales=st.permutations([-3.0, -4.5, -7.0]),
-    weight=st.floats(0.01, 0.99),
-)
-@settings(max_examples=40, deadline=None)
-def test_halves_lie_side_by_side_on_the_longest_axis(turn, log_scales, weight):
-    params = make(20, opacity=weight, indicator=0.5)
-    with torch.no_grad():
-        params["quats"][3] = torch.tensor(turn)
-        params["log_scales"][3] = torch.tensor(log_scales)
-    whole = {name: value[3].detach().clone() for name, value in params.items()}
-    report = run(params, state_of([COLD] * 3 + [HOT] + [COLD] * 16), LONG_AXIS)
-    assert report == DensifyReport(cloned=0, split=1, pruned=0, count=21)
-    halves = {name: value[19:].detach() for name, value in params.items()}
-    longest = torch.tensor(log_scales).argmax()
-    axis = quat_to_rotmat(whole["quats"])[:, longest] * math.exp(-3.0)
-    torch.testing.assert_close(halves["means"][0], whole["means"] + 0.8 * axis)
-    torch.testing.assert_close(halves["means"][1], whole["means"] - 0.8 * axis)
-    smaller = torch.full((3,), 0.85).index_fill(0, longest, 0.6)
-    torch.testing.assert_close(
-        halves["log_scales"].exp(), (whole["log_scales"].exp() * smaller).expand(2, 3)
-    )
-    torch.testing.assert_close(halves["opacity_logits"].sigmoid(), torch.full((2,), 0.6 * weight))
-    for name in ("quats", "sh0", "shN", "features", "indicator_logits"):
-        assert torch.equal(halves[name], whole[name].expand_as(halves[name]))
-
-
-def test_halves_have_their_own_moments_and_no_seed_moves_them():
-    left, right = make(20, MIDDLE), make(20)
-    with torch.no_grad():
-        right["log_scales"][:] = left["log_scales"]
-    optimizer = adam(left)
-    step_once(left, optimizer)
-    before = optimizer.state[left["means"]]["exp_avg"]
-    with torch.no_grad():
-        for name in right:
-            right[name][:] = left[name]
-    state = [HOT, COLD] * 10
-    densify(left, optimizer, state_of(state), LONG_AXIS, EXTENT, 0, EARLY)
-    densify(right, adam(right), state_of(state), LONG_AXIS, EXTENT, 1, LATE - 50)
-    assert all(torch.equal(left[name], right[name]) for name in left)
-    moments = optimizer.state[left["means"]]["exp_avg"]
-    assert torch.equal(moments[:10], before[1::2])
-    assert moments[10:].eq(0).all()
-
-
-def test_halves_of_what_is_faint_and_of_a_shape_of_languages_own():
-    params = make(20, opacity=0.008)
-    params["language_log_scales"] = nn.Parameter(torch.tensor([[-3.0, -2.0, -4.0]]).repeat(20, 1))
-    params["language_quats"] = nn.Parameter(params["quats"].detach().flip(0))
-    run(params, state_of([HOT] + [COLD] * 19), LONG_AXIS)
-    torch.testing.assert_close(
-        params["opacity_logits"][19:].sigmoid(), torch.full((2,), 0.008)
-    )  # 0.6 of it would be pruned
-    language = torch.tensor([-3.0, -2.0, -4.0]) + torch.tensor([0.85, 0.6, 0.85]).log()
-    torch.testing.assert_close(params["language_log_scales"][19:].detach(), language.expand(2, 3))
 
 
 def test_only_the_opacity_counts_when_asked():
