@@ -99,6 +99,7 @@ def test_without_a_parent_runs_start_cold(tmp_path: Path, monkeypatch: pytest.Mo
     leave_parent()
 
 
+@pytest.mark.slow
 def test_the_parent_has_one_thread_and_a_child_as_many_as_it_asks_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -155,6 +155,7 @@ def test_a_workload_survives_the_disk(w: Workload, tmp_path: Path):
         assert shared == (i == 1)
 
 
+@pytest.mark.slow
 def test_memory_grows_with_the_image(tmp_path: Path):
     small, large = tmp_path / "small", tmp_path / "large"
     save_workload(small, make_workload(50, 32, 24, channels=64))
@@ -186,6 +187,7 @@ def test_error_and_pareto_write_their_files(tmp_path: Path, w: Workload):
     assert points.groupby(["scene", "truth"]).front_worst_gradient.any().all()
 
 
+@pytest.mark.slow
 def test_a_broken_bound_is_status_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -14,6 +14,7 @@ from vlgs.heads.linear import Linear
 from vlgs.opened.answers import ask_view
 
 
+@pytest.mark.slow
 def test_every_way_has_its_time_and_its_error(tmp_path: Path):
     trained = train_a_little([*QUICK, "head.cache_dir=null", "head.training.steps=20"], steps=1)
     rows = run_query(trained, (200, 36, 30), [1], 2, tmp_path, seed=0)

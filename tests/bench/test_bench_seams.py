@@ -8,6 +8,7 @@ from vlgs.bench import seams
 from vlgs.bench.iteration import IterationSize
 
 
+@pytest.mark.slow
 def test_seams_are_measured_on_the_same_bits_or_not_at_all(monkeypatch: pytest.MonkeyPatch):
     size = IterationSize(300, 48, 36, 4, 0)
     monkeypatch.setattr(seams, "SMALL", IterationSize(60, 24, 18, 4, 0))

@@ -153,6 +153,7 @@ def test_the_last_iteration_is_evaluated():
         assert min(evaluated_at(iterations, 8)) >= 1
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped_goes_on_with_its_clocks_and_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

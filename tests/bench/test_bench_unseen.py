@@ -33,6 +33,7 @@ def test_a_run_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert len(read_record(tmp_path / "unseen.csv")) == 1
 
 
+@pytest.mark.slow
 def test_methods_of_several_stages_are_measured_too(tmp_path: Path):
     command = [
         "unseen",

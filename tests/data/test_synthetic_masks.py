@@ -46,6 +46,7 @@ def test_missed_masks_leave_holes_at_their_rate():
     )  # 2160 masks: three standard deviations are 0.026
 
 
+@pytest.mark.slow
 def test_parts_are_missed_with_the_thing_they_are_of_at_the_shared_rate():
     for shared, same in ((1.0, 1.0), (0.8, 0.8 + 0.2 * (0.7**2 + 0.3**2)), (0.0, 0.7**2 + 0.3**2)):
         found = []
@@ -68,6 +69,7 @@ def test_shared_fates_leave_whole_things_and_every_rate_as_they_were():
     assert holes[1] == pytest.approx(holes[0], abs=0.08)
 
 
+@pytest.mark.slow
 def test_mislabelled_masks_carry_another_class_at_their_rate():
     wrong = []
     for _, _, part, _ in views(LabelNoise(0.0, 0.0, 0.15, 0.0, 0.0)):

@@ -53,6 +53,7 @@ def test_a_plain_wall_is_a_class_without_points():
     assert height.max() < 0.1  # floor and strays, nothing of the wall
 
 
+@pytest.mark.slow
 def test_held_out_views_are_between_beyond_and_above():
     scene = load("glassware_ring", train=12)
     centers = [camera_center(v.camera.viewmat).numpy() for v in (*scene.train, *scene.test)]

@@ -147,6 +147,7 @@ def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, ca
     assert "could not be read" in caplog.text
 
 
+@pytest.mark.slow
 def test_mask_levels_share_what_scenes_need_of_the_photographs(tmp_path, monkeypatch):
     cached: dict[str, Any] = SMALL | {"cache": str(tmp_path), "seed": 7}  # that no test has traced
     read, whole = [], Archive.read
@@ -232,6 +233,7 @@ def test_points_lie_on_the_surfaces_that_their_view_sees():
         assert 0.9 < (error < 0.01).mean() < 1  # the rest is stray, or slips off an edge
 
 
+@pytest.mark.slow
 def test_mask_levels_nest_in_number(scene):
     counts = [
         len(load_scene(width=160, height=120, train_views=5, test_views=2, level=k).mask_vectors)

@@ -22,12 +22,12 @@ SMOKE = (*TINY, "trainer=smoke", "trainer.iterations=10", "pictures=false", "thr
 
 QUICK = {
     "python -m vlgs.ablate tab=ab-multi": ("dry=true",),
-    "python -m vlgs.tables": (),
 }
 """Command -> what makes it quick."""
 GATED = "python -m vlgs.run --config-dir=my_conf fusion=gated plugins=[my_lab]"
 """Of CONTRIBUTING, after its fusion."""
 SLOW = {
+    "python -m vlgs.tables": (),
     "python -m vlgs.check data=colmap data.root=SCENE": (),
     "python -m vlgs.run": SMOKE,
     "python -m vlgs.run fusion=none indicator=opacity blend=none": SMOKE,

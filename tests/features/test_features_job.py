@@ -12,6 +12,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image
 from rich.console import Console
+from slow import with_slow
 from tiny_models import save_siglip
 
 from vlgs import vocabulary
@@ -337,7 +338,7 @@ def test_an_extractor_of_your_own_needs_only_its_target():
     assert given.features.extractor == {"_target_": "my_lab.Masks"}
 
 
-@pytest.mark.parametrize("module", ["vlgs.features", "vlgs.check"])
+@pytest.mark.parametrize("module", with_slow(["vlgs.features", "vlgs.check"], ["vlgs.check"]))
 def test_each_entry_point_has_a_manual_of_its_own(module: str, tmp_path: Path):
     import subprocess
     import sys

@@ -10,6 +10,7 @@ from vlgs.data import synthetic
 from vlgs.gsplat.example import main, start, train
 
 
+@pytest.mark.slow
 def test_it_learns_a_scene():
     scene = synthetic.load_scene(width=48, height=36, train_views=6, test_views=2, points=300)
     splats, losses = train(scene, 40)

@@ -35,6 +35,7 @@ def strategy(**changed: Any) -> Any:
     return gsplat.DefaultStrategy(**{**often, "grow_grad2d": 2e-3, "prune_opa": 0.07, **changed})
 
 
+@pytest.mark.slow
 def test_its_strategy_grows_and_prunes_and_the_loss_falls(scene: Scene):
     torch.manual_seed(0)
     grown = strategy()

@@ -174,6 +174,7 @@ def test_no_two_classes_share_a_code_that_was_placed_apart():
     assert min(nearest(seed, spread=48) for seed in range(4)) > 35  # 46 here, up to 54
 
 
+@pytest.mark.slow
 def test_faint_codes_say_what_all_masks_have_in_common_and_long_ones_their_own():
     vectors, areas, labels = masks(cone(12), 10, seed=3)
     classes = normalize(torch.stack([vectors[labels == k].mean(dim=0) for k in range(12)]))
@@ -202,6 +203,7 @@ def test_faint_codes_say_what_all_masks_have_in_common_and_long_ones_their_own()
     assert found > 0.8
 
 
+@pytest.mark.slow
 def test_of_several_draws_the_one_that_reconstructs_best_stays():
     vectors, areas, _ = masks(cone(5), 10, seed=2)
 

@@ -266,6 +266,7 @@ def test_help_is_a_manual_and_needs_no_torch():
         assert section in done.stdout
 
 
+@pytest.mark.slow
 def test_garbage_is_looked_for_again_after_the_imports():
     program = """
 import gc

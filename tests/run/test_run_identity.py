@@ -71,6 +71,7 @@ def test_a_run_with_other_questions_takes_the_models_that_are_there(whole: RunFo
     assert not taken.curves.samefile(whole.curves)
 
 
+@pytest.mark.slow
 def test_a_plugin_whose_class_is_moved_has_its_run_and_one_that_is_edited_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from omegaconf import DictConfig
+from slow import with_slow
 from tiny_runs import TINY, composed
 
 import vlgs.fields.language_field
@@ -121,7 +122,7 @@ def runner(monkeypatch: pytest.MonkeyPatch) -> Runner:
     return Runner(monkeypatch)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", with_slow(METHODS, ["fmgs", "langsplat_equal", "opennerf"]))
 def test_it_trains_stops_goes_on_and_comes_back(tmp_path: Path, runner: Runner, method: str):
     chosen = (f"method={method}", *SHORTER.get(method, ()))
     whole = runner(tmp_path / "whole", *chosen, "threads=2")

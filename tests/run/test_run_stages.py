@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 
 import vlgs.training.workshop
@@ -46,7 +47,9 @@ def metrics_of(folder: RunFolder) -> dict:
     return json.loads(folder.metrics.read_text())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", with_slow(KINDS, ["levels=separate", "sharing=lifted", "augment=offline"])
+)
 def test_every_model_has_a_folder_and_the_run_one_result(tmp_path: Path, kind: str):
     overrides, stages = KINDS[kind]
     config = composed(*SHORT, *overrides, f"results={tmp_path}")
@@ -83,7 +86,7 @@ RESUMED = {
 """Overrides, and how many models are trained."""
 
 
-@pytest.mark.parametrize("kind", RESUMED)
+@pytest.mark.parametrize("kind", with_slow(RESUMED, set(RESUMED) - {"levels=separate"}))
 def test_stopped_in_the_second_stage_it_goes_on_to_the_same_bits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
@@ -41,7 +42,16 @@ def trained(scene: Scene, folder: Path, color: bool, *overrides: str) -> VLGSMod
 
 @pytest.mark.parametrize(
     "indicator",
-    ["learned", "learned indicator.reach=10.0", "opacity", "fixed", "fixed indicator.value=1.0"],
+    with_slow(
+        [
+            "learned",
+            "learned indicator.reach=10.0",
+            "opacity",
+            "fixed",
+            "fixed indicator.value=1.0",
+        ],
+        ["learned indicator.reach=10.0", "fixed", "fixed indicator.value=1.0"],
+    ),
 )
 def test_the_united_model_renders_what_each_set_does(
     tiny_scene: Scene, tmp_path: Path, indicator: str

@@ -11,13 +11,14 @@ from tests.stress.record import FAILED, NOT_RUN, run_cases, show_table
 from vlgs.bench.record import read_record
 
 SLOW = (
+    "N2 poison",
     "N1 poisoned gradients",
     "N1 hostile training",
     "N12 threads and repeats, v4",
     "N12 threads and repeats, v3",
     "N12 threads and repeats, base",
 )
-"""Trainings, of 20 seconds and more on a busy machine, or in a process of their own."""
+"""Trainings, of 5 seconds and more, or in a process of their own."""
 
 
 def marked(case: Case):

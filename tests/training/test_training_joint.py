@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
@@ -205,7 +206,7 @@ def test_a_level_is_rendered_and_asked_as_if_it_were_alone(scenes: list[Scene]):
         SplatField(model, level=3)
 
 
-@pytest.mark.parametrize("overrides", [(), ("indicator=per_level", "fusion=none")])
+@pytest.mark.parametrize("overrides", with_slow([(), ("indicator=per_level", "fusion=none")], [()]))
 @pytest.mark.usefixtures("unchecked")
 def test_resume_is_bit_identical(scenes: list[Scene], tmp_path: Path, overrides: tuple[str, ...]):
     joint, options = join_levels(scenes), (*overrides, *DENSIFY)

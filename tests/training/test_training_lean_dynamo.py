@@ -66,10 +66,12 @@ def test_a_step_of_an_optimizer_loads_no_compiler_and_a_compilation_does():
     assert third.split() == ["torch._dynamo.config", "True", "True"]
 
 
+@pytest.mark.slow
 def test_a_part_of_the_compiler_loads_the_whole():
     assert said(SUBMODULE_FIRST) == ["torch._dynamo.config torch._dynamo.eval_frame"]
 
 
+@pytest.mark.slow
 def test_a_compiler_that_is_loaded_stays():
     assert said(LOADED_BEFORE) == ["True"]
 

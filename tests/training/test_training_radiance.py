@@ -7,6 +7,7 @@ from typing import Any
 import lightning
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import composed
 
 from vlgs.experiment import construct
@@ -77,7 +78,7 @@ def made(progress: Progress) -> dict[str, torch.Tensor]:
     }
 
 
-@pytest.mark.parametrize("model", [1, 2])
+@pytest.mark.parametrize("model", with_slow([1, 2], [1]))
 @pytest.mark.usefixtures("unchecked")
 def test_stopped_in_either_stage_it_goes_on_to_the_same_bits(
     tiny_scene: Scene, tmp_path: Path, model: int

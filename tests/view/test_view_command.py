@@ -67,6 +67,7 @@ def test_a_port_in_use_is_refused(folder: Path):
     assert "203.0.113.9 must be free" in refused(str(folder), "--host", "203.0.113.9")
 
 
+@pytest.mark.slow
 def test_the_first_picture_needs_no_browser_and_no_server(folder: Path, tmp_path: Path):
     out = tmp_path / "first.png"
     main([str(folder), "--word", "mug", "--picture", str(out)])

@@ -132,6 +132,7 @@ def test_a_typed_word_changes_the_picture_where_the_object_is(page: Page, shown:
     assert psnr(after, want) >= 25
 
 
+@pytest.mark.slow
 def test_an_unknown_word_is_answered_in_words(page: Page):
     before = page.settled()
     page.ask("zeppelin")
@@ -142,6 +143,7 @@ def test_an_unknown_word_is_answered_in_words(page: Page):
     page.wait_for("mug: 0")
 
 
+@pytest.mark.slow
 def test_a_photographs_camera_can_be_jumped_to(page: Page, shown: Shown):
     before = page.settled()
     view = shown.run.cameras("train")[3]
@@ -153,6 +155,7 @@ def test_a_photographs_camera_can_be_jumped_to(page: Page, shown: Shown):
     assert psnr(before, want) < 25
 
 
+@pytest.mark.slow
 def test_the_picture_and_the_gaussians_of_a_word_are_downloaded(page: Page, shown: Shown):
     page.ask("mug")
     page.wait_for("mug: 0")
