@@ -56,7 +56,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
         "trainer.rates_for=null",
         *(f"{_RATE}{name}={rate:g}" for name, rate in asdict(LearningRates()).items()),
     ),
-    "paper's rates of language": (f"{_RATE}features=5e-3", f"{_RATE}indicator_logits=5e-2"),
+    "twice the rates of language": (f"{_RATE}features=1e-2", f"{_RATE}indicator_logits=0.1"),
     "rates that stay": ("trainer.color_decay=1",),
     "positions that come to rest": (f"{_RATE}means_final=1.6e-6",),
     "last values": ("trainer.average_color=0", "trainer.average_language=0"),
@@ -68,7 +68,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
     ),
     "what no view shows stays": ("gaussians.densify.prune_unseen=0",),
 }
-"""What ``trainer=fast`` is without one of its parts."""
+"""What ``trainer=fast`` is without one of its parts, or with language that learns faster."""
 
 RECIPES: dict[str, tuple[str, ...]] = {
     "default": (),
