@@ -29,7 +29,6 @@ def save_three(folder: Path, kill: Kill | None, told: Path) -> int:
         os._exit(status)
 
 
-@pytest.mark.slow
 def test_a_save_killed_anywhere_leaves_what_was_saved_before(tmp_path: Path):
     told = tmp_path / "calls.json"
     assert save_three(tmp_path / "whole", None, told) == 0
