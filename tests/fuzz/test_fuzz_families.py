@@ -13,13 +13,13 @@ from vlgs.ablate import warm
 from vlgs.ablate.warm import WarmParent
 
 SAMPLES = {
-    "files": ("--count", "8"),
+    "files": ("--count", "14"),
     "bombs": ("--every", "29"),
     "paths": ("--count", "42", "--every", "6"),
     "places": ("--every", "64"),
-    "text": ("--every", "14", "--count", "0"),
-    "results": ("--every", "52", "--count", "0"),
-    "scene_files": ("--count", "5"),
+    "text": ("--every", "7", "--count", "0"),
+    "results": ("--every", "26", "--count", "0"),
+    "scene_files": ("--count", "8"),
 }
 LARGER = {
     "files": ("--count", "40"),
@@ -27,7 +27,6 @@ LARGER = {
     "paths": ("--count", "42"),
     "places": ("--every", "16"),
     "results": ("--every", "13", "--count", "0"),
-    "text": ("--every", "7", "--count", "0"),
     "scene_files": ("--count", "30"),
 }
 
