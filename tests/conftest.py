@@ -152,6 +152,35 @@ def traced_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def codes_fitted_once(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Hundreds of runs of the same few scenes fit the same autoencoder, for half a second each; where it is tested itself it is fitted."""
+    from vlgs.heads.autoencoder import Autoencoder
+
+    if request.path.parent.name == "heads":
+        yield
+        return
+    fit = Autoencoder._fit
+
+    def fit_once(self: Autoencoder, vectors: Any, areas: Any) -> None:
+        layout = (self.dim, self.encoder_widths, self.decoder_widths, self.center, vectors.shape)
+        key = (layout, repr(self.fit_settings), vectors.numpy().tobytes(), areas.numpy().tobytes())
+        if key in FITTED:
+            self.build(vectors.shape[1])
+            self.load_state_dict(pickle.loads(FITTED[key]))
+        else:
+            fit(self, vectors, areas)
+            FITTED[key] = pickle.dumps(self.state_dict())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Autoencoder, "_fit", fit_once)
+        yield
+
+
+FITTED = dict[Any, bytes]()
+"""Autoencoder and what it was fitted to -> its weights."""
+
+
 @pytest.fixture(scope="session", autouse=True)
 def frame_rates_of_few_views() -> Iterator[None]:
     """A run takes up to five seconds to measure its frame rates, which no test compares."""

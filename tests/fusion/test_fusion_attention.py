@@ -6,11 +6,11 @@ import sys
 import jaxtyping
 import pytest
 import torch
+from instruction_sets import require_other
 from torch import Tensor, nn
 
 from vlgs.fusion.attention import CrossAttention, SelfAttention
 from vlgs.fusion.mlp import MLP
-from vlgs.ops import _csrc
 from vlgs.ops.attention import Token
 
 READINGS = [(4, 1), (1, 4), (2, 3)]
@@ -218,10 +218,7 @@ def test_every_bit_is_the_same_on_any_number_of_threads(build, feature_dim: int,
 
 @pytest.mark.parametrize("isa", ["base", "v3", "v4"])
 def test_every_instruction_set_gives_the_same_up_to_rounding(isa: str):
-    if isa not in _csrc.isas().split():
-        pytest.skip(
-            f"this build and this machine have {_csrc.isas()}; VLGS_ISAS chooses what is built"
-        )
+    require_other(isa)
     # In a process of its own: the choice is made once.
     code = """if True:
         import torch

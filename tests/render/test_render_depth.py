@@ -5,15 +5,16 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import pytest
 import torch
+from instruction_sets import require_other
 from render_hard_scenes import HARD_SCENES
 from render_scenes import RenderScene, camera_at_origin, random_splats, sure_pixels
 from torch import Tensor
 
-from vlgs.ops import _csrc
 from vlgs.ops import rasterize_reference as reference
 from vlgs.ops.depth import render_depth
 from vlgs.types import Camera, DepthKind, RasterConfig
@@ -185,7 +186,7 @@ def test_threads_and_repeats_do_not_change_a_bit(kind: DepthKind):
 
 SCRIPT = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = sys.argv[1:]
 import torch
 from render_scenes import random_splats
 from test_render_depth import assert_agree
@@ -200,11 +201,9 @@ print(_csrc.isa())
 
 @pytest.mark.parametrize("isa", ["base", "v3", "v4"])
 def test_every_instruction_set_draws_the_reference(isa: str):
-    if isa not in _csrc.isas().split():
-        pytest.skip(
-            f"this build and this machine have {_csrc.isas()}; VLGS_ISAS chooses what is built"
-        )
-    command = [sys.executable, "-c", SCRIPT, os.path.dirname(__file__)]
+    require_other(isa)
+    folder = Path(__file__).parent
+    command = [sys.executable, "-c", SCRIPT, folder, folder.parent]
     environment = os.environ | {"VLGS_ISA": isa}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from instruction_sets import require_other
 from render_scenes import random_splats, render_with_gradients
 
 from vlgs.ops import _csrc
@@ -57,10 +58,7 @@ for dtype, bound in ((torch.float32, 1e-4), (torch.float64, 1e-10)):
 
 @pytest.mark.parametrize("isa", ["base", "v3", "v4"])
 def test_every_instruction_set_draws_the_reference(isa: str):
-    if isa not in _csrc.isas().split():
-        pytest.skip(
-            f"this build and this machine have {_csrc.isas()}; VLGS_ISAS chooses what is built"
-        )
+    require_other(isa)
     environment = os.environ | {"VLGS_ISA": isa}
     command = [sys.executable, "-c", SCRIPT, os.path.dirname(__file__)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

@@ -42,6 +42,8 @@ RAYS = (
     "+stages.0.radiance={_target_: vlgs.fields.radiance.RadianceConfig, coarse: 32, samples: 8}",
     *("data.width=24", "data.height=18"),
 )
+QUICK = {"vlgs", "best", "lift", "gs3d", "gs_grouping"}
+"""One of each way of training that is not longer than others: both at once, colour and then a linear system, colour alone, a head that trains."""
 SHORTER = {
     "lerf": (
         *RAYS,
@@ -122,7 +124,7 @@ def runner(monkeypatch: pytest.MonkeyPatch) -> Runner:
     return Runner(monkeypatch)
 
 
-@pytest.mark.parametrize("method", with_slow(METHODS, ["fmgs", "langsplat_equal", "opennerf"]))
+@pytest.mark.parametrize("method", with_slow(METHODS, set(METHODS) - QUICK))
 def test_it_trains_stops_goes_on_and_comes_back(tmp_path: Path, runner: Runner, method: str):
     chosen = (f"method={method}", *SHORTER.get(method, ()))
     whole = runner(tmp_path / "whole", *chosen, "threads=2")

@@ -48,7 +48,7 @@ def metrics_of(folder: RunFolder) -> dict:
 
 
 @pytest.mark.parametrize(
-    "kind", with_slow(KINDS, ["levels=separate", "sharing=lifted", "augment=offline"])
+    "kind", with_slow(KINDS, ["levels=separate", "sharing=lifted", "augment=offline", "all of it"])
 )
 def test_every_model_has_a_folder_and_the_run_one_result(tmp_path: Path, kind: str):
     overrides, stages = KINDS[kind]

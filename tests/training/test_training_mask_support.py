@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from slow import with_slow
 from test_training_training import assert_same_bits, module_of, stop_at, train
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -173,7 +174,7 @@ def test_all_stay_where_most_would_go(tiny_scene: Scene, caplog: pytest.LogCaptu
     assert "all stay" in caplog.text
 
 
-@pytest.mark.parametrize("stop", [2, 8])  # before and after masks are judged
+@pytest.mark.parametrize("stop", with_slow([2, 8], [2]))  # before and after masks are judged
 @pytest.mark.usefixtures("unchecked")
 def test_a_run_resumes_to_the_bit(tiny_scene: Scene, tmp_path: Path, stop: int):
     scene, _ = with_a_lie(tiny_scene)

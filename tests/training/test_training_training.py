@@ -6,6 +6,7 @@ from typing import cast
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 from torch import Tensor
 
@@ -76,7 +77,7 @@ def stop_at(module: VLGSModule, step: int) -> None:
 
 
 # 5: between densifications, statistics half gathered; 8: right after one; 13: after the reset; 17: after a degree joined.
-@pytest.mark.parametrize("stop", [5, 8, 13, 17])
+@pytest.mark.parametrize("stop", with_slow([5, 8, 13, 17], [8, 17]))
 @pytest.mark.usefixtures("unchecked")
 def test_resume_is_bit_identical_to_never_having_stopped(
     tiny_scene: Scene, tmp_path: Path, stop: int
@@ -98,7 +99,7 @@ CHOSEN = ("gaussians.densify.long_axis=true", "gaussians.densify.by_error=true")
 """How everyday trainers densify."""
 
 
-@pytest.mark.parametrize("stop", [3, 9])  # 3: small views; 9: whole ones
+@pytest.mark.parametrize("stop", with_slow([3, 9], [9]))  # 3: small views; 9: whole ones
 @pytest.mark.usefixtures("unchecked")
 def test_densification_by_error_resumes_to_the_bit(tiny_scene: Scene, tmp_path: Path, stop: int):
     options = (*CHOSEN, "trainer.half_size=0.3", "trainer.iterations=15")
