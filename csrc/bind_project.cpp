@@ -10,7 +10,7 @@ namespace vlgs {
 namespace {
 
 Camera make_camera(const std::vector<double> &viewmat, const std::vector<double> &intrinsics,
-                   const std::vector<double> &slopes, double near, double blur) {
+                   const std::vector<double> &slopes, double near, double near_sigmas, double blur) {
   if (viewmat.size() != 16 || intrinsics.size() != 4 || slopes.size() != 4)
     throw std::invalid_argument("Camera: viewmat, intrinsics, slopes must be 16, 4 and 4 numbers");
   Camera c;
@@ -21,7 +21,7 @@ Camera make_camera(const std::vector<double> &viewmat, const std::vector<double>
   c.fx = intrinsics[0], c.fy = intrinsics[1], c.cx = intrinsics[2], c.cy = intrinsics[3];
   c.slope_low[0] = slopes[0], c.slope_high[0] = slopes[1];
   c.slope_low[1] = slopes[2], c.slope_high[1] = slopes[3];
-  c.near = near, c.blur = blur;
+  c.near = near, c.near_sigmas = near_sigmas, c.blur = blur;
   return c;
 }
 
@@ -61,9 +61,10 @@ void bind_project(nb::module_ &m) {
       .def(
           "__init__",
           [](Camera *self, const std::vector<double> &viewmat, const std::vector<double> &intrinsics,
-             const std::vector<double> &slopes, double near,
-             double blur) { new (self) Camera(make_camera(viewmat, intrinsics, slopes, near, blur)); },
-          "viewmat"_a, "intrinsics"_a, "slopes"_a, "near"_a, "blur"_a);
+             const std::vector<double> &slopes, double near, double near_sigmas, double blur) {
+            new (self) Camera(make_camera(viewmat, intrinsics, slopes, near, near_sigmas, blur));
+          },
+          "viewmat"_a, "intrinsics"_a, "slopes"_a, "near"_a, "near_sigmas"_a, "blur"_a);
   bind_project_of<float>(m);
   bind_project_of<double>(m);
 }

@@ -40,7 +40,7 @@ struct Camera {
   double rotation[9], translation[3];  // world to camera
   double fx, fy, cx, cy;               // pixels
   double slope_low[2], slope_high[2];  // where x/z and y/z are clamped in the Jacobian
-  double near, blur;                   // world units; pixel^2
+  double near, near_sigmas, blur;      // world units; standard deviations along the view axis; pixel^2
 };
 
 // On the image plane a Gaussian is an ellipse written row by row: given y, x is normal about

@@ -80,6 +80,10 @@ inline Projection project_rows(const Camera &c, const Input &g) {
   p.slope_y = p.in_camera.y * p.inv_z;
   p.norm2 = p.in_front ? p.norm2 : all(1);
   p.axes = rotation(g.qw, g.qx, g.qy, g.qz, 2 / p.norm2);
+  if (c.near_sigmas > 0) {
+    const Vec3 deep = all(c.near_sigmas) * times(in_axes(p.axes, w2), g.scale);
+    p.in_front = p.in_front & (p.in_camera.z * p.in_camera.z > dot(deep, deep));
+  }
   p.ray1 = w0 - clamp(p.slope_x, c.slope_low[0], c.slope_high[0]) * w2;
   p.ray2 = w1 - clamp(p.slope_y, c.slope_low[1], c.slope_high[1]) * w2;
   p.seen1 = in_axes(p.axes, p.ray1);

@@ -110,6 +110,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     **dict.fromkeys(("lift.border", "lift.alike", "lift.trial"), 0),
     **dict.fromkeys(("stages.lift.border", "stages.lift.alike", "stages.lift.trial"), 0),
     "query.masks": None,
+    "raster.near_sigmas": 0,
     "stages": None,
     **dict.fromkeys(("trainer.average_language", "trainer.average_color"), 0),
     "trainer.color_decay": 1,

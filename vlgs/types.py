@@ -168,6 +168,10 @@ class RasterConfig:
 
     near: float = 0.01
     """Gaussians with a view-space depth at or below this are culled, in world units."""
+    near_sigmas: float = 0.0
+    """Those with a depth of at most so many of their own standard deviations along the view axis are culled as well; 0: none. A Gaussian is
+    drawn by the projection's Jacobian at its centre, which says nothing of one that reaches the plane of the camera: what is large, far
+    away and far to the side would lie over the whole image as fog."""
     eps2d: float = 0.3
     """Added to the diagonal of the 2D covariance, in pixel^2."""
     alpha_min: float = 1.0 / 255.0

@@ -56,7 +56,7 @@ def browser() -> Iterator[Any]:
 KINDS = {
     "one shape": {},
     "own shape": {"own_shape": True},
-    "other constants": {"raster": RasterConfig(eps2d=0.1, near=3.8)},
+    "other constants": {"raster": RasterConfig(eps2d=0.1, near=3.8, near_sigmas=40.0)},
 }
 """How the scene of a page was trained; at 3.8 units the near plane cuts through the nearer ball."""
 

@@ -188,6 +188,7 @@ def _config(rng: np.random.Generator, tame: bool) -> RasterConfig:
         fov_margin=float(rng.choice([0.3, 0.0, 10.0])),
         memory_budget=2 << 30 if tame or rng.random() < 0.95 else 4096,
         **{switch: bool(rng.integers(4)) for switch in SWITCHES},
+        near_sigmas=float(rng.choice([0.0, 1.0, 1e-6])),
     )
 
 

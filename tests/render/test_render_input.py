@@ -115,7 +115,8 @@ def test_lists_beyond_the_budget_are_refused_before_they_are_made():
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"near": 0.0}, "near"), ({"eps2d": 0.0}, "eps2d"), ({"alpha_min": 0.0}, "alpha_min"),
+        ({"near": 0.0}, "near"), ({"near_sigmas": -0.5}, "near_sigmas"),
+        ({"near_sigmas": math.nan}, "near_sigmas"), ({"eps2d": 0.0}, "eps2d"), ({"alpha_min": 0.0}, "alpha_min"),
         ({"alpha_min": 0.995}, "alpha_min"), ({"alpha_max": 1.0}, "alpha_max"),
         ({"transmittance_min": 1.0}, "transmittance_min"), ({"stop": "now"}, "stop"),
         ({"fov_margin": -0.1}, "fov_margin"), ({"fov_margin": math.inf}, "fov_margin"),

@@ -29,6 +29,7 @@ OVERRIDES = (
     "gaussians.densify.stop=0",
     # The paper's step: `vlgs.bench.seams` writes it out, and times stay comparable with those of before language and blur were ours.
     "raster.eps2d=0.3",
+    "raster.near_sigmas=0",
     "trainer.indicator_reach=0.0",
     "trainer.language_weight=1.0",
     "trainer.language_error=mse",

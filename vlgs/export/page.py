@@ -48,6 +48,7 @@ def write_page(opened: OpenedRun, content: Content) -> bytes:
         "focus": center.tolist(),
         "up": upright(viewmats).tolist(),
         "near": constants.near,
+        "near_sigmas": constants.near_sigmas,
         "blur": constants.eps2d,
         "alpha": (constants.alpha_min, constants.alpha_max),
         "margin": constants.fov_margin,

@@ -23,6 +23,7 @@ class Camera:
         intrinsics: Sequence[float],
         slopes: Sequence[float],
         near: float,
+        near_sigmas: float,
         blur: float,
     ) -> None: ...
 

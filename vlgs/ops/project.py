@@ -43,7 +43,8 @@ def _kernel_camera(camera: Camera, config: RasterConfig) -> _csrc.Camera:
         -(cy + y) / fy, (camera.height - cy + y) / fy,
     ]  # fmt: skip
     viewmat = camera.viewmat.flatten().tolist()
-    return _csrc.Camera(viewmat, [fx, fy, cx, cy], slopes, config.near, config.eps2d)
+    cut = config.near, config.near_sigmas
+    return _csrc.Camera(viewmat, [fx, fy, cx, cy], slopes, *cut, config.eps2d)
 
 
 def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: _csrc.Camera):

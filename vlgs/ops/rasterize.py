@@ -131,6 +131,7 @@ def check_config(config: RasterConfig) -> None:
     """
     rules = {
         "near": (config.near > 0, "> 0"),
+        "near_sigmas": (config.near_sigmas >= 0, ">= 0"),
         "eps2d": (config.eps2d > 0, "> 0"),
         # Below 2^-100 the kernel's exponent would leave the range of normal floats.
         "alpha_min": (1e-30 <= config.alpha_min < config.alpha_max, "in [1e-30, alpha_max)"),

@@ -23,7 +23,7 @@ class _Splats(NamedTuple):
     """Its determinant, formed without cancellation."""
     depth: Float[Tensor, " n"]
     in_front: Bool[Tensor, " n"]
-    """Beyond the near plane and with a rotation."""
+    """Beyond the near plane, by its own depth as well (`RasterConfig.near_sigmas`), and with a rotation."""
 
 
 def rasterize(
@@ -92,6 +92,9 @@ def _project(
 
     in_camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     in_front = (in_camera[:, 2] > config.near) & (quats.square().sum(dim=1) > 0)
+    if config.near_sigmas > 0:
+        along_view = viewmat[2, :3] @ (_rotations(quats, in_front) * scales[:, None, :])
+        in_front &= in_camera[:, 2] > config.near_sigmas * along_view.norm(dim=1)
     in_camera = torch.where(in_front[:, None], in_camera, torch.ones_like(in_camera))
     depth = in_camera[:, 2]
     slope = in_camera[:, :2] / depth[:, None]

@@ -176,6 +176,7 @@ class Painter {
     gl.uniform2f(at.size, width, height);
     gl.uniform4f(at.slopes, -(cx + beyondX) / fx, -(cy + beyondY) / fy, (width - cx + beyondX) / fx, (height - cy + beyondY) / fy);
     gl.uniform1f(at.near, about.near);
+    gl.uniform1f(at.nearSigmas, about.near_sigmas);
     gl.uniform1f(at.blur, about.blur);
     gl.uniform1f(at.least, about.alpha[0]);
     gl.uniform1f(at.most, about.alpha[1]);

@@ -10,7 +10,7 @@ uniform vec3 right, down, ahead, eye;  // rows of the rotation, and where the ca
 uniform vec4 lens;                     // fx, fy, cx, cy in pixels
 uniform vec2 size;
 uniform vec4 slopes;                   // x/z and y/z beyond which the projection is not bent further: low x y, high x y
-uniform float near, blur, least;
+uniform float near, nearSigmas, blur, least;  // nearSigmas: of a splat's own standard deviations
 uniform vec2 colors, further;          // what 0 and 1 stand for, of colours and of harmonics
 uniform int coefficients;
 uniform bool language;
@@ -53,6 +53,7 @@ void main() {
   vec4 a = uintBitsToFloat(texelFetch(shapes, texel + ivec2(1, 0), 0));
   vec2 b = uintBitsToFloat(texelFetch(shapes, texel + ivec2(2, 0), 0)).xy;
   mat3 covariance = mat3(a.x, a.y, a.z, a.y, a.w, b.x, a.z, b.x, b.y);
+  if (there.z * there.z <= nearSigmas * nearSigmas * dot(ahead, covariance * ahead)) return;
   vec2 slope = clamp(there.xy / there.z, slopes.xy, slopes.zw);
   vec3 u = lens.x / there.z * (right - slope.x * ahead), v = lens.y / there.z * (down - slope.y * ahead);
   vec3 spread = covariance * u;
