@@ -102,3 +102,22 @@ def test_lonely_gaussians_are_those_that_training_views_do_not_see():
     # One training view makes every Gaussian lonely; what is not covered at all does not count.
     assert share_lonely(model, scene) <= share_lonely(model, alone)
     assert share_lonely(model, alone) > 0.1
+
+
+def test_recipes_beside_the_first_take_turns_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def skip(task: object, label: str, overrides: list[str], seed: int, *_: object) -> None:
+        turns.append((seed, label, *overrides))
+
+    turns: list[tuple[int | str, ...]] = []
+    monkeypatch.setattr(unseen, "_row", skip)
+    monkeypatch.setattr(unseen, "draw_unseen", lambda *_: None)
+    command = ["unseen", "--scenes", "mirrors_sky", "--views", "4", "--seeds", "0", "1", "--recipe", "one"]  # fmt: skip
+    command += ["--override", "a=1", "--beside", "two", "a=2", "b=3", "--beside", "three", "--out"]
+    assert main([*command, str(tmp_path)]) == 0
+    once = [("one", "a=1"), ("two", "a=2", "b=3"), ("three",)]
+    assert turns == [(seed, *recipe) for seed in (0, 1) for recipe in once]
+    for wrong in ("two", "one", "a=4"):
+        assert main([*command, str(tmp_path), "--beside", wrong]) != 0
+        assert f"--beside needs a name of its own, got '{wrong}'" in capsys.readouterr().err

@@ -144,6 +144,10 @@ def unseen(parser: ArgumentParser) -> Runner:
     parser.add_argument("--splits", nargs="+", help="of them: every 8th, a tenth; default: both")
     parser.add_argument("--recipe", default="default", help="a name for what --override changes")
     parser.add_argument("--override", nargs="+", default=[], metavar="KEY=VALUE")
+    parser.add_argument(
+        "--beside", nargs="+", action="append", default=[], metavar=("NAME", "KEY=VALUE"),
+        help="another recipe, trained in turns with the first; may be given again",
+    )  # fmt: skip
     parser.add_argument("--train-threads", type=int, default=1)
 
     def run(args: Namespace) -> int:
@@ -153,7 +157,12 @@ def unseen(parser: ArgumentParser) -> Runner:
         views, seeds = ([4], [args.seed]) if args.quick else (args.views, args.seeds)
         splits = args.splits or SPLITS
         tasks = make_tasks(scenes, views, args.root, args.resize, args.quick, splits)
-        run_unseen(tasks, {args.recipe: args.override}, seeds, args.out, args.train_threads)
+        recipes = {args.recipe: args.override}
+        for name, *overrides in args.beside:
+            if name in recipes or "=" in name:
+                raise ValueError(f"bench: --beside needs a name of its own, got {name!r}")
+            recipes[name] = overrides
+        run_unseen(tasks, recipes, seeds, args.out, args.train_threads)
         return 0
 
     return run
