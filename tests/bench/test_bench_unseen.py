@@ -114,10 +114,21 @@ def test_recipes_beside_the_first_take_turns_with_it(
     monkeypatch.setattr(unseen, "_row", skip)
     monkeypatch.setattr(unseen, "draw_unseen", lambda *_: None)
     command = ["unseen", "--scenes", "mirrors_sky", "--views", "4", "--seeds", "0", "1", "--recipe", "one"]  # fmt: skip
-    command += ["--override", "a=1", "--beside", "two", "a=2", "b=3", "--beside", "three", "--out"]
+    command += [
+        "--override",
+        "a=1",
+        "--beside",
+        "two",
+        "a=2",
+        "b=3",
+        "--beside",
+        "c=4",
+        "c=4",
+        "--out",
+    ]
     assert main([*command, str(tmp_path)]) == 0
-    once = [("one", "a=1"), ("two", "a=2", "b=3"), ("three",)]
+    once = [("one", "a=1"), ("two", "a=2", "b=3"), ("c=4", "c=4")]
     assert turns == [(seed, *recipe) for seed in (0, 1) for recipe in once]
-    for wrong in ("two", "one", "a=4"):
-        assert main([*command, str(tmp_path), "--beside", wrong]) != 0
-        assert f"--beside needs a name of its own, got '{wrong}'" in capsys.readouterr().err
+    for wrong in (["two", "a=5"], ["one", "a=5"], ["trainer=fast"]):
+        assert main([*command, str(tmp_path), "--beside", *wrong]) != 0
+        assert f"its own and what it changes, got '{wrong[0]}'" in capsys.readouterr().err

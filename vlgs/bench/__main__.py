@@ -159,8 +159,10 @@ def unseen(parser: ArgumentParser) -> Runner:
         tasks = make_tasks(scenes, views, args.root, args.resize, args.quick, splits)
         recipes = {args.recipe: args.override}
         for name, *overrides in args.beside:
-            if name in recipes or "=" in name:
-                raise ValueError(f"bench: --beside needs a name of its own, got {name!r}")
+            if name in recipes or not overrides:
+                raise ValueError(
+                    f"bench: --beside needs a name of its own and what it changes, got {name!r}"
+                )
             recipes[name] = overrides
         run_unseen(tasks, recipes, seeds, args.out, args.train_threads)
         return 0
