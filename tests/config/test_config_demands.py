@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from slow import with_slow
 from tiny_runs import composed
 
 from tests.fuzz.commands import command
@@ -35,7 +36,10 @@ class Apart(Gated):
 """
 
 
-@pytest.mark.parametrize("demand", DEMANDS, ids=str)
+LIFTED = [demand for demand in DEMANDS if demand in Lifted.demands]
+
+
+@pytest.mark.parametrize("demand", with_slow(DEMANDS, LIFTED[1:]), ids=str)
 def test_a_demand_names_options_that_exist_and_one_that_meets_it(demand: Demand):
     group, _, name = demand.asker.partition("=")
     assert name in options(group)

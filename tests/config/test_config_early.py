@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 
 from vlgs.config import check_config
@@ -28,22 +29,27 @@ def begun(*overrides: str) -> None:
     [
         (["method=lift", "head.dim=768"], "identity head: dim must be the embedding width 512, got 768"),
         (["method=goi", "head.width=768"], "lookup head: width must be the embedding width 512, got 768"),
-        (["method=langsplat_v2", "head.width=8"], "codebook head: width must be the embedding width 512, got 8"),
+        pytest.param(["method=langsplat_v2", "head.width=8"], "codebook head: width must be the embedding width 512, got 8", marks=pytest.mark.slow),
         (["method=best", "head.dim=600"], "principal head: dim must be at most the embedding width 512, got 600"),
         (["method=langsplat", "head.weights=conf/config.yaml"], "conf/config.yaml"),
         (["method=goi", "loss=langsplat"], "loss must be goi with head=lookup, as its scores of rows are no embeddings, got langsplat"),
-        (["method=legaussians", "loss=default"], "loss must be legaussians with head=quantised, as .*, got default"),
+        pytest.param(["method=legaussians", "loss=default"], "loss must be legaussians with head=quantised, as .*, got default", marks=pytest.mark.slow),
         (["method=langsplat", "loss=gs3d"], "loss must be .* with a stage without colour, as it trains language alone, got gs3d"),
         (["method=best", "gaussians.codes=sparse"], "gaussians must be default with language that is lifted, as codes=sparse .*, got default with other values"),
         (["gaussians.init_features=lifted", "gaussians.codes=sparse"], "codes must be none or unit with init_features=lifted, .*, got sparse"),
     ],
 )  # fmt: skip
+@pytest.mark.usefixtures("unchecked")
 def test_it_is_refused_before_anything_is_trained(overrides: list[str], message: str):
     with pytest.raises((ValueError, OSError), match=message):
         begun(*overrides)
 
 
-@pytest.mark.parametrize("method", ["vlgs", "langsplat", "goi", "legaussians", "lift", "best"])
+@pytest.mark.parametrize(
+    "method",
+    with_slow(["vlgs", "langsplat", "goi", "legaussians", "lift", "best"], ["langsplat", "lift"]),
+)
+@pytest.mark.usefixtures("unchecked")
 def test_methods_as_they_stand_are_not(method: str):
     begun(f"method={method}")
 

@@ -127,6 +127,7 @@ def other(value: Any) -> Any:
     return 1 if value is None else value + 1 if isinstance(value, int | float) else f"{value}_"
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_every_value_that_can_move_a_number_moves_the_id_and_no_other_does(
     every_option: list[DictConfig],
 ):

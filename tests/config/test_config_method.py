@@ -44,7 +44,12 @@ def chosen(tmp_path: Path):
     (tmp_path / "method" / "features.yaml").write_text(FEATURES)
     (tmp_path / "method" / "lifted.yaml").write_text(LIFT)
     path = f"hydra.searchpath=[file://{tmp_path}]"
-    return lambda *overrides: composed(path, *TINY, *overrides)
+
+    def compose(*overrides: str) -> DictConfig:
+        own = {"method=features", "method=lifted"} & {*overrides}
+        return composed(*([path] if own else []), *TINY, *overrides)
+
+    return compose
 
 
 def test_a_method_is_an_overlay_that_the_command_line_overrides(chosen):
@@ -78,9 +83,10 @@ def test_what_a_method_trains_moves_the_id_and_the_name_of_a_class_does_not(chos
     assert option("stages.0", "vlgs.training.stages.Train") == "train"
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_method_runs(chosen, tmp_path: Path):
     config = chosen(
-        "method=features", "trainer=smoke", "trainer.iterations=12", f"results={tmp_path}"
+        "method=features", "trainer=smoke", "trainer.iterations=6", f"results={tmp_path}"
     )
     config.pictures = False
     assert run(config) == 0
@@ -88,7 +94,7 @@ def test_a_method_runs(chosen, tmp_path: Path):
     for name in ("", "geometry"):
         checkpoint = load_checkpoint(RunFolder(path / name).checkpoint)
         assert checkpoint is not None
-        assert checkpoint.step == 12
+        assert checkpoint.step == 6
     assert (path / "point_cloud.ply").is_file()
     assert not (path / "geometry" / "point_cloud.ply").exists()
 
@@ -113,6 +119,7 @@ def test_a_method_runs(chosen, tmp_path: Path):
         (["stages=[{_target_: vlgs.run.run}]"], "stages.0._target_ must be one of"),
     ],
 )  # fmt: skip
+@pytest.mark.usefixtures("unchecked")
 def test_what_no_method_can_be_is_refused(chosen, overrides: list[str], message: str):
     config = chosen(*overrides)
 
@@ -186,6 +193,7 @@ RELEASED = [
 
 
 @pytest.mark.parametrize("method", RELEASED)
+@pytest.mark.usefixtures("unchecked")
 def test_the_budget_of_the_released_programs_goes_with_every_method(method: str):
     config = composed(f"method={method}", "trainer=released")
     check_config(config)

@@ -137,9 +137,22 @@ def test_words_that_the_vocabulary_lacks_are_a_warning(tmp_path: Path):
     )
 
 
+def write_damaged(folder: Path) -> None:
+    write_scene(folder)
+    (folder / "images" / "frame_00001.png").write_bytes(b"")
+
+
+def test_the_command_exits_with_the_verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_damaged(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    done = command("check", ["data=colmap", f"data.root={tmp_path}"])
+    assert done.status == 1, done.text
+    assert "not usable: 1 errors" in done.text
+
+
+@pytest.mark.slow
 def test_the_process_exits_with_the_verdict(tmp_path: Path):
-    write_scene(tmp_path)
-    (tmp_path / "images" / "frame_00001.png").write_bytes(b"")
+    write_damaged(tmp_path)
     done = subprocess.run(
         [sys.executable, "-m", "vlgs.check", "data=colmap", f"data.root={tmp_path}"],
         capture_output=True,

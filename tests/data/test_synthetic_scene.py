@@ -12,6 +12,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from slow import with_slow
 from torch import Tensor
 
 from vlgs.data.synthetic import NO_NOISE, LabelNoise, SceneSettings, capture, load_scene
@@ -42,25 +43,21 @@ def objects(view: View) -> ObjectLabels:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(width=160, height=120, train_views=5, test_views=2)
+    return load_scene(width=120, height=90, train_views=5, test_views=2)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "glassware",
-        "mirrors",
-        "lookalikes",
-        "patchwork",
-        "wirework",
-        "rows",
-        "smallware",
-        "sunroom",
-    ],
-)
-@pytest.mark.parametrize("difficulty", DIFFICULTIES)
+SCENES = [
+    (name, difficulty)
+    for name in ("glassware", "mirrors", "lookalikes", "patchwork", "wirework", "rows", "smallware", "sunroom")
+    for difficulty in DIFFICULTIES
+]  # fmt: skip
+
+
+# Every scene is loaded, by turns in the one or in the other difficulty.
+@pytest.mark.parametrize("chosen", with_slow(SCENES, [*SCENES[1::4], *SCENES[2::4]]), ids="-".join)
 @pytest.mark.usefixtures("unchecked")
-def test_every_scene_loads(name, difficulty):
+def test_every_scene_loads(chosen):
+    name, difficulty = chosen
     scene = load_scene(name, difficulty, **SMALL)
     assert scene.name == name  # tables look runs up by data.scene
     assert (len(scene.train), len(scene.test)) == (4, 2)
@@ -83,6 +80,7 @@ def test_every_scene_loads(name, difficulty):
     assert all(view.read_masks is None for view in scene.test)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_same_arguments_give_the_same_bits():
     first = load_scene(**SMALL)
     capture._kept.cache_clear()
@@ -123,6 +121,7 @@ def test_a_fault_written_out_is_the_same_as_the_preset():
     assert load_scene(**SMALL).fingerprint == written.fingerprint(3)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_photographs_are_traced_once_for_all_processes(tmp_path, monkeypatch, caplog):
     cached: dict[str, Any] = SMALL | {"cache": str(tmp_path / "cache")}
 
@@ -220,6 +219,7 @@ def test_points_project_onto_pixels_of_their_colour(scene):
     assert 3000 < len(scene.points) <= 4000
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_points_lie_on_the_surfaces_that_their_view_sees():
     scene = load_scene("lookalikes", **SMALL)
     taken = capture.open_capture(SceneSettings(find_scene("lookalikes"), **SMALL))
@@ -236,7 +236,7 @@ def test_points_lie_on_the_surfaces_that_their_view_sees():
 @pytest.mark.slow
 def test_mask_levels_nest_in_number(scene):
     counts = [
-        len(load_scene(width=160, height=120, train_views=5, test_views=2, level=k).mask_vectors)
+        len(load_scene(width=120, height=90, train_views=5, test_views=2, level=k).mask_vectors)
         for k in (1, 2, 3)
     ]
     assert counts[0] > counts[1] > counts[2] == len(scene.mask_vectors)

@@ -31,6 +31,7 @@ CUP = "props: {cup: {parts: [{sphere: {radius: 0.1}, matte: {color: red}}]}}\n"
 PLACED = "objects: [{prop: cup, at: [0, 0]}]\n"
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_example_of_the_manual_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("breakfast.yaml").write_text(EXAMPLE)
@@ -43,6 +44,7 @@ def test_the_example_of_the_manual_is_trained(tmp_path: Path, monkeypatch: pytes
     assert metrics["miou_translucent_reflective"] is not None
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_content_counts_and_the_file_does_not(tmp_path: Path):
     one, other, moved = (tmp_path / name for name in ("one.yaml", "other.yml", "moved.yaml"))
     one.write_text(CUP + PLACED)

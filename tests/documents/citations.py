@@ -66,10 +66,11 @@ def prose(name: str, text: str) -> Iterator[tuple[int, str]]:
     """Line numbers and texts of what a person reads in a file: comments, docstrings, documents."""
     suffix = Path(name).suffix
     if suffix == ".py":
-        for token in tokenize.generate_tokens(io.StringIO(text).readline):
-            if token.type == tokenize.COMMENT:
-                yield token.start[0], token.string
-        for node in ast.walk(ast.parse(text)):
+        if "#" in text:
+            for token in tokenize.generate_tokens(io.StringIO(text).readline):
+                if token.type == tokenize.COMMENT:
+                    yield token.start[0], token.string
+        for node in _statements(ast.parse(text)):
             value = node.value if isinstance(node, ast.Expr) else None
             if isinstance(value, ast.Constant) and isinstance(value.value, str):
                 yield value.lineno, value.value
@@ -80,6 +81,13 @@ def prose(name: str, text: str) -> Iterator[tuple[int, str]]:
         for number, line in enumerate(text.splitlines(), 1):
             if mark in line:
                 yield number, line[line.index(mark) :]
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(node, field, ()):
+            yield inner
+            yield from _statements(inner)
 
 
 def dead(name: str, text: str) -> list[str]:
@@ -125,6 +133,7 @@ def _problems(name: str, said: str) -> Iterator[tuple[int, str]]:
             yield match.start(), f"{match[0]}: sweeps give this table another number"
 
 
+@cache
 def _is_file(name: str, token: str) -> bool:
     if token in _FOREIGN or token in _EXAMPLES or token.startswith(_WRITTEN):
         return True
@@ -134,6 +143,7 @@ def _is_file(name: str, token: str) -> bool:
     return "/" not in token and token in _basenames()
 
 
+@cache
 def _is_module(dotted: str) -> bool:
     folder, *rest = dotted.split(".")
     path = ROOT / folder

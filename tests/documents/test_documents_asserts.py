@@ -17,21 +17,24 @@ def functions(folder: Path) -> Iterator[tuple[str, ast.FunctionDef]]:
 def empty_tests(folder: Path) -> list[str]:
     """Tests without ``assert``, ``pytest.raises``, ``assert_close`` and the like, in themselves or in what they call."""
     checking = {"raises", "warns", "fail"}
-    known = list(functions(folder))
-    while found := {n.name for _, n in known if n.name not in checking and _checks(n, checking)}:
+    known = [(place, node.name, _called(node)) for place, node in functions(folder)]
+    while found := {
+        name for _, name, called in known if name not in checking and called & checking
+    }:
         checking |= found
-    return [place for place, n in known if n.name.startswith("test_") and n.name not in checking]
+    return [place for place, name, _ in known if name.startswith("test_") and name not in checking]
 
 
-def _checks(function: ast.FunctionDef, checking: set[str]) -> bool:
+def _called(function: ast.FunctionDef) -> set[str]:
+    """Names of what a function calls; ``assert`` and whatever is named like it is ``fail``."""
+    found = set[str]()
     for node in ast.walk(function):
         if isinstance(node, ast.Assert):
-            return True
+            found.add("fail")
         if isinstance(node, ast.Call):
             called = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            if called.startswith("assert_") or called in checking:
-                return True
-    return False
+            found.add("fail" if called.startswith("assert_") else called)
+    return found
 
 
 def test_every_test_asserts_something():

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from slow import with_slow
 
 from tests.fuzz.commands import TINY, both
 from vlgs.command import check_command
@@ -46,7 +47,14 @@ def test_a_mistake_is_told_before_anything_is_imported(line: str):
         check_command(arguments)
 
 
-@pytest.mark.parametrize("line", REFUSED)
+OF_A_KIND = [
+    line
+    for line in REFUSED
+    if line.startswith(("trainer.learning_rates", "threads", "blend", "raster"))
+]
+
+
+@pytest.mark.parametrize("line", with_slow(REFUSED, OF_A_KIND))
 def test_check_and_run_refuse_alike(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     checked, ran = both([*TINY, line], tmp_path / "results")
@@ -55,7 +63,9 @@ def test_check_and_run_refuse_alike(line: str, tmp_path: Path, monkeypatch: pyte
     assert not (tmp_path / "results").exists()
 
 
-@pytest.mark.parametrize("place", ["file", "file/below", "gone", "round", "n" * 300])
+@pytest.mark.parametrize(
+    "place", with_slow(["file", "file/below", "gone", "round", "n" * 300], ["file", "round"])
+)
 def test_results_that_cannot_be_kept_are_refused_by_check_and_run(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

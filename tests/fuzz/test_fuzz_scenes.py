@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from slow import with_slow
 
 from tests.fuzz.commands import both
 from tests.fuzz.scenes import OPTIONS, cases, write
@@ -16,7 +17,14 @@ SAMPLE = (
 )
 
 
-@pytest.mark.parametrize("case", [c for c in cases() if c.name in SAMPLE], ids=lambda c: c.name)
+CASES = [case for case in cases() if case.name in SAMPLE]
+
+
+@pytest.mark.parametrize(
+    "case",
+    with_slow(CASES, [case for case in CASES if "negatives" in case.name]),
+    ids=lambda case: case.name,
+)
 def test_check_and_run_agree(case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "scene", case.scene)

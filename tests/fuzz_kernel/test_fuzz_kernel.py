@@ -121,6 +121,18 @@ def moves_masked_pixels(a: Any, b: Any, valid: Any, scale: float, d_a: Any, thre
     squared_error_backward(a, b, None, scale, d_a, threads)
 
 
+def run_many() -> None:
+    for seed in range(60):
+        run_layers(seed, (nan, inf, 1e38))
+
+
+@pytest.fixture(scope="module")
+def right() -> None:
+    """The kernels as they are pass."""
+    run_many()
+
+
+@pytest.mark.usefixtures("right")
 @pytest.mark.parametrize(
     "wrong",
     [reads_everything, counts_one_more, hides_what_is_no_number, moves_masked_pixels],
@@ -128,12 +140,7 @@ def moves_masked_pixels(a: Any, b: Any, valid: Any, scale: float, d_a: Any, thre
 def test_a_wrong_squared_error_is_a_failure(
     monkeypatch: pytest.MonkeyPatch, wrong: Callable[..., Any]
 ):
-    def run() -> None:
-        for seed in range(60):
-            run_layers(seed, (nan, inf, 1e38))
-
-    run()
     backward = wrong is moves_masked_pixels
     monkeypatch.setattr(_csrc, "squared_error" + "_backward" * backward, wrong)
     with pytest.raises(AssertionError, match=r"squared error must be that of float64"):
-        run()
+        run_many()

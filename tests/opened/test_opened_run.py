@@ -82,7 +82,7 @@ def test_a_field_that_answers_for_all_mask_levels_has_none_to_choose(opened: Ope
 
 @pytest.mark.parametrize("levels", ["separate", "joint"])
 def test_several_mask_levels_come_back(tmp_path: Path, levels: str):
-    config = composed(*TINY, "trainer=smoke", "trainer.iterations=6", f"levels={levels}", "pictures=false", f"results={tmp_path}")  # fmt: skip
+    config = composed(*TINY, "trainer=smoke", "trainer.iterations=2", f"levels={levels}", "pictures=false", f"results={tmp_path}")  # fmt: skip
     assert run(config) == 0
     opened = open_run(next((tmp_path / "runs").iterdir()))
     assert isinstance(opened.field, SeveralFields) == (levels == "separate")
@@ -91,7 +91,7 @@ def test_several_mask_levels_come_back(tmp_path: Path, levels: str):
 
 
 def test_colour_and_language_apart_come_back(tmp_path: Path):
-    config = composed(*TINY, "trainer=smoke", "trainer.iterations=6", "sharing=none", "fusion=none", "pictures=false", f"results={tmp_path}")  # fmt: skip
+    config = composed(*TINY, "trainer=smoke", "trainer.iterations=2", "sharing=none", "fusion=none", "pictures=false", f"results={tmp_path}")  # fmt: skip
     assert run(config) == 0
     opened = open_run(next((tmp_path / "runs").iterdir()))
     seen = opened.field.render(opened.cameras()[0].camera, frozenset({"color", "feature"}))

@@ -13,6 +13,7 @@ from render_scenes import (
     render_with_gradients,
     sure_pixels,
 )
+from slow import with_slow
 from torch import Tensor
 
 from vlgs.types import RasterConfig
@@ -41,7 +42,7 @@ def assert_agree(splats: RenderScene, config: RasterConfig | None = None) -> Non
 
 
 @pytest.mark.parametrize("stop", ["after", "before"])
-@pytest.mark.parametrize("first", range(0, 120, 20))
+@pytest.mark.parametrize("first", with_slow(range(0, 120, 20), (60, 80, 100)))
 def test_random_scenes(first: int, stop: str):
     for seed in range(first, first + 20):
         splats = random_splats(
@@ -88,7 +89,7 @@ def test_hard_scenes(scene: Callable[[], RenderScene], stop: str, eps2d: float):
     assert_agree(scene(), config)
 
 
-@pytest.mark.parametrize("eps2d", BLURS)
+@pytest.mark.parametrize("eps2d", with_slow(BLURS, BLURS[1:]))
 def test_float32_within_its_promise(eps2d: float):
     """Images within 1e-5, gradients within 1e-3 and 0.99999 in direction, off the cutoffs."""
     config = RasterConfig(eps2d=eps2d)

@@ -189,7 +189,7 @@ def test_labels_of_an_unknown_class_are_refused():
     ("protocol", "name"),
     [
         (Ovs3dArgmax(), "ovs3d_argmax@1/synthetic"),
-        (Ovs3dThreshold(), "ovs3d_threshold@1/synthetic"),
+        pytest.param(Ovs3dThreshold(), "ovs3d_threshold@1/synthetic", marks=pytest.mark.slow),
         (Goi(), "mipnerf360_goi@1/synthetic"),
         (LerfOvs(), "lerf_ovs@1/synthetic"),
     ],

@@ -231,12 +231,25 @@ def test_tracks_of_no_image_are_one_line_and_leave_nothing(tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
+DROPPED = "left out: 1 rows, log_scales must be finite"
+
+
+def test_rows_that_are_not_finite_are_left_out_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    Path("a.splat").write_bytes(bytes(32))
+    main(["a.splat", "b.ply", "--drop"])
+    assert DROPPED in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_as_a_program(tmp_path: Path):
     (tmp_path / "a.splat").write_bytes(bytes(32))
     command = [sys.executable, "-m", "vlgs.convert", "a.splat", "b.ply", "--drop"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "left out: 1 rows, log_scales must be finite" in done.stdout
+    assert DROPPED in done.stdout
 
 
 def test_a_run_starts_from_a_file_and_its_content_is_part_of_the_id(tmp_path: Path):

@@ -1,4 +1,5 @@
 import json
+import os
 import re
 import shutil
 import signal
@@ -15,6 +16,8 @@ from vlgs.config import CONF
 from vlgs.report.results import METRICS
 from vlgs.run import run
 from vlgs.runs import UNSCORED, RunFolder
+from vlgs.training.checkpoint import load_checkpoint
+from vlgs.training.lightning import VLGSModule
 
 SHORT = (*TINY, "trainer=smoke", "trainer.iterations=30")
 
@@ -167,7 +170,31 @@ def test_a_word_that_the_vocabulary_lacks_ends_the_run_before_training(tmp_path:
     assert not (tmp_path / "runs").exists()
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path):
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    original = VLGSModule.training_step
+
+    def training_step(self: VLGSModule, step: int, batch_idx: int) -> None:
+        original(self, step, batch_idx)
+        if step == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(VLGSModule, "training_step", training_step)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        said = in_process("run", [*SHORT, f"results={tmp_path}", "pictures=false"])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert said.status == 130, said.text
+    told = "SIGINT: stopped and saved at step 5 of 30; the same command goes on from there"
+    assert told in said.text
+    assert "python -m vlgs.run" in said.text
+    checkpoint = load_checkpoint(only_run(tmp_path).checkpoint)
+    assert checkpoint is not None
+    assert checkpoint.step == 5
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_process_that_saves(tmp_path: Path):
     overrides = (
         *TINY,
         "trainer=smoke",
@@ -194,8 +221,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path):
     )
     assert match, errors
     assert "python -m vlgs.run" in errors
-    from vlgs.training.checkpoint import load_checkpoint
-
     checkpoint = load_checkpoint(only_run(tmp_path).checkpoint)
     assert checkpoint is not None
     assert checkpoint.step == int(match[1])

@@ -81,7 +81,7 @@ def remade(path: Path) -> None:
     [
         (shutil.rmtree, 8),  # the last
         (remade, 3),
-        (lambda path: path.rename(path.with_name("moved")), 4),
+        pytest.param(lambda path: path.rename(path.with_name("moved")), 4, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_whose_folder_goes_ends_with_an_error(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 from viewer_3dgs import C0, Pinhole, draw_color, draw_language, read_columns, read_rows
 
@@ -121,7 +122,9 @@ def language_error(stage: Made, camera: Camera) -> float:
     return float(np.abs(drawn - expected.numpy()).max() / expected.abs().max().clamp_min(1e-9))
 
 
-@pytest.mark.parametrize("together", TOGETHER, ids=" ".join)
+@pytest.mark.parametrize(
+    "together", with_slow(TOGETHER, [("sharing=pos",), ("sharing=pos_cov",)]), ids=" ".join
+)
 def test_a_viewer_shows_the_picture_and_the_language_of_the_run(
     go: Callable[..., Done], tiny_scene: Scene, together: tuple[str, ...]
 ):
@@ -190,7 +193,7 @@ def test_raw_parameters_would_show_another_picture(
     assert lines[-1].startswith("beware: the file does not say whether")
 
 
-@pytest.mark.parametrize("fusion", ["self", "none"])
+@pytest.mark.parametrize("fusion", with_slow(["self", "none"], ["none"]))
 def test_a_run_that_starts_from_the_file_starts_with_its_picture(
     go: Callable[..., Done], tiny_scene: Scene, fusion: str
 ):

@@ -50,7 +50,7 @@ def trained(scene: Scene, folder: Path, color: bool, *overrides: str) -> VLGSMod
             "fixed",
             "fixed indicator.value=1.0",
         ],
-        ["learned indicator.reach=10.0", "fixed", "fixed indicator.value=1.0"],
+        ["learned indicator.reach=10.0", "opacity", "fixed", "fixed indicator.value=1.0"],
     ),
 )
 def test_the_united_model_renders_what_each_set_does(

@@ -192,6 +192,7 @@ SHORT = (
 )
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_training_moves_both_shapes_and_resumes_bit_for_bit(tiny_scene: Scene, tmp_path: Path):
     whole = module_of(tiny_scene, *SHORT)
     fit(whole, RunFolder(tmp_path / "whole"), FitOptions(meta={}, progress=False))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from slow import with_slow
 from tables_fakes import BENCHMARK, fake_runs, filled_of, value
 
 from vlgs.identity import RESULTS_VERSION
@@ -132,12 +133,15 @@ def test_the_report_has_its_pictures(table: Table, tmp_path: Path):
 
 @pytest.mark.parametrize(
     "content",
-    [
-        b"",
-        b"mine\n1\n",
-        b"step,psnr\n\n\n10,20.0\n\xff,\xfe\n1,2,3,4,5\n20,2\0\n20",
-        bytes(range(256)),
-    ],
+    with_slow(
+        [
+            b"",
+            b"mine\n1\n",
+            b"step,psnr\n\n\n10,20.0\n\xff,\xfe\n1,2,3,4,5\n20,2\0\n20",
+            bytes(range(256)),
+        ],
+        [b"mine\n1\n", bytes(range(256))],
+    ),
 )
 def test_a_damaged_log_costs_its_own_points_only(table: Table, tmp_path: Path, content: bytes):
     fake_runs(tmp_path, [table], BENCHMARK, value)
@@ -344,8 +348,8 @@ def test_tables_without_torch_on_400_runs(tmp_path: Path):
     ("argument", "message"),
     [
         ("results=nowhere", "must hold a benchmark"),
-        ("html=maybe", "html must be true or false"),
-        ("tabs=a", "must be tab="),
+        pytest.param("html=maybe", "html must be true or false", marks=pytest.mark.slow),
+        pytest.param("tabs=a", "must be tab=", marks=pytest.mark.slow),
     ],
 )
 def test_a_slip_on_the_command_line_is_one_line(argument: str, message: str, tmp_path: Path):

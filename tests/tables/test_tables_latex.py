@@ -17,6 +17,8 @@ from vlgs.tables.registry import Row, Table, load_tables
 from vlgs.tables.write import write_all
 from vlgs.text import latex as escape
 
+TABLES = load_tables()
+
 
 def test_best_is_bold_and_second_underlined_within_a_group(table: Table, tmp_path: Path):
     fake_runs(tmp_path, [table], BENCHMARK, value)
@@ -49,9 +51,10 @@ def test_latex_is_well_formed_and_compiles(table: Table, tmp_path: Path):
         )
 
 
-@pytest.mark.parametrize("label", sorted(load_tables()))
+@pytest.mark.parametrize("label", sorted(TABLES))
+@pytest.mark.usefixtures("unchecked")
 def test_every_table_of_the_registry_is_well_formed_without_a_run(label: str):
-    table = load_tables()[label]
+    table = TABLES[label]
     rows = tuple(
         Row(**{**vars(row), "overrides": () if row.overrides is not None else None})
         for row in table.rows  # what they override is test_tables_registry's

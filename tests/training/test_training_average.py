@@ -59,7 +59,10 @@ def mean_of(seen: list[Mapping[str, Tensor]], name: str, since: int) -> Tensor:
     return torch.stack(kept).double().mean(0).float()
 
 
-@pytest.mark.parametrize(("share", "since"), [(0.25, 18), (0.9, FIRST), (1.0, FIRST)])
+@pytest.mark.parametrize(
+    ("share", "since"),
+    [(0.25, 18), (0.9, FIRST), pytest.param(1.0, FIRST, marks=pytest.mark.slow)],
+)
 def test_language_is_the_mean_of_the_last_iterations_and_colour_the_last(
     tiny_scene: Scene, tmp_path: Path, share: float, since: int
 ):
@@ -73,6 +76,7 @@ def test_language_is_the_mean_of_the_last_iterations_and_colour_the_last(
             assert torch.equal(value, seen[-1][name]), name
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_colour_is_all_else(tiny_scene: Scene, tmp_path: Path):
     module, seen = fitted(tiny_scene, tmp_path, "trainer.average_color=0.5")
     for name, value in module.step.trained():
@@ -82,6 +86,7 @@ def test_colour_is_all_else(tiny_scene: Scene, tmp_path: Path):
             torch.testing.assert_close(value, mean_of(seen, name, 12), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_resumed_mean_is_that_of_a_run_in_one_go(tiny_scene: Scene, tmp_path: Path):
     averages = ("trainer.average_language=0.5", "trainer.average_color=0.25")
     whole, _ = fitted(tiny_scene, tmp_path / "whole", *averages)
@@ -93,6 +98,7 @@ def test_a_resumed_mean_is_that_of_a_run_in_one_go(tiny_scene: Scene, tmp_path: 
         assert torch.equal(one, other), name
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_nothing_is_averaged_by_default(tiny_scene: Scene, tmp_path: Path):
     module, seen = fitted(tiny_scene, tmp_path)
     assert all(torch.equal(value, seen[-1][name]) for name, value in module.step.trained())

@@ -70,6 +70,7 @@ def test_a_cut_file_gives_way_to_the_one_before(
     assert [p.name for p in tmp_path.iterdir()] == ["step_00000005.safetensors"]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_no_flipped_bit_is_taken(tmp_path: Path):
     path = save_checkpoint(tmp_path, example(5))
     data = path.read_bytes()

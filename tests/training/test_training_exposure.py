@@ -63,6 +63,7 @@ def test_dark_photographs_have_dark_maps(tmp_path: Path):
     assert abs(float(dark.mean() / bright.mean()) - 0.6) < 0.15
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_resumed_run_has_the_same_maps(tmp_path: Path):
     # What depends on the budget is switched off: the first half is a run of its own.
     budget = ("trainer.iterations=12", "trainer.means_steps=12", "gaussians.silent_above=1.0")

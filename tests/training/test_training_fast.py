@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
@@ -80,7 +81,7 @@ def test_views_are_small_in_the_first_half(tiny_scene: Scene, tmp_path: Path):
     assert seen[0]() is None  # what it had read is given up
 
 
-@pytest.mark.parametrize("stop", [5, 8, 11])
+@pytest.mark.parametrize("stop", with_slow([5, 8, 11], [5, 11]))
 @pytest.mark.usefixtures("unchecked")
 def test_stopped_before_at_and_after_the_change_it_goes_on_to_the_same_bits(
     tiny_scene: Scene, tmp_path: Path, stop: int

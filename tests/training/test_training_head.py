@@ -84,6 +84,7 @@ def test_it_learns_the_embeddings_of_the_masks(tiny_scene: Scene, tmp_path: Path
     assert cosine() > 0.85
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_run_answers_at_every_level(tmp_path: Path):
     overrides = ("trainer.iterations=10", "pictures=false", "levels=joint")
     assert run(composed(*LINEAR, *overrides, f"results={tmp_path}")) == 0

@@ -164,7 +164,11 @@ def alike_matrix(model: SplatModel, mass: Tensor, strength: float) -> Tensor:
 
 @pytest.mark.parametrize(
     ("border", "strength"),
-    [pytest.param(1.3, 0.0, marks=pytest.mark.slow), (0.0, 2.0), (0.7, 0.5)],
+    [
+        pytest.param(1.3, 0.0, marks=pytest.mark.slow),
+        pytest.param(0.0, 2.0, marks=pytest.mark.slow),
+        (0.7, 0.5),
+    ],
 )
 def test_borders_and_likeness_are_part_of_the_system(
     model: SplatModel, scene: Scene, border: float, strength: float

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 from torch import Tensor
 
@@ -126,7 +127,7 @@ def test_what_no_view_shows_goes_when_densification_ends(tiny_scene: Scene, tmp_
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("until", [STOP - 1, STOP])
+@pytest.mark.parametrize("until", with_slow([STOP - 1, STOP], [STOP]))
 def test_it_resumes_to_the_bit(tiny_scene: Scene, tmp_path: Path, until: int):
     options = (f"{PRUNE}=0.5",)
     whole, first, second = (module_of(tiny_scene, *options) for _ in range(3))

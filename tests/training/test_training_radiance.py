@@ -194,7 +194,8 @@ def test_rates_fall_to_the_last_step_and_no_farther():
         (["sharing=none", "fusion=none"], "sharing must be pos or pos_cov with stages of a method"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("method", ["lerf", "opennerf"])
+@pytest.mark.parametrize("method", with_slow(["lerf", "opennerf"], ["opennerf"]))
+@pytest.mark.usefixtures("unchecked")
 def test_axes_that_it_cannot_have_are_refused(method: str, overrides: list[str], message: str):
     with pytest.raises(ValueError, match=message):
         construct(composed(f"method={method}", *overrides))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from slow import with_slow
 from tiny_runs import TINY, composed
 from torch import Tensor
 
@@ -82,7 +83,7 @@ def test_pixels_that_no_photograph_covers_do_not_count():
     assert not outside_masks(named(module_of(scene))).any()
 
 
-@pytest.mark.parametrize("indicator", ["learned", "per_level"])
+@pytest.mark.parametrize("indicator", with_slow(["learned", "per_level"], ["learned"]))
 def test_every_level_is_asked_by_itself(indicator: str):
     scenes = [module_of(None, f"data.level={level}").views.scene for level in (1, 2, 3)]
     blank = tuple(

@@ -74,6 +74,7 @@ def test_each_option_contributes_its_part_of_the_list():
         assert list(list_stages([sharing], language=False)) == want
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_features_alone_learn_on_the_geometry_of_an_earlier_stage(
     tiny_scene: Scene, tmp_path: Path
 ):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from jaxtyping import Int
+from slow import with_slow
 from tiny_runs import TINY, composed
 from torch import Tensor
 
@@ -61,7 +62,10 @@ def module_of(method: str, scene: Scene, *overrides: str) -> VLGSModule:
     return build_module(scene, parts, 0)
 
 
-@pytest.mark.parametrize("method", ["best", "goi", "langsplat", "langsplat_v2", "lift"])
+@pytest.mark.parametrize(
+    "method",
+    with_slow(["best", "goi", "langsplat", "langsplat_v2", "lift"], ["langsplat_v2", "lift"]),
+)
 def test_without_masks_what_colour_made_stays_as_it_is(
     tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ):

@@ -76,13 +76,18 @@ def stop_at(module: VLGSModule, step: int) -> None:
     module.training_step = training_step  # type: ignore[method-assign]
 
 
+@pytest.fixture(scope="module")
+def whole(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> VLGSModule:
+    """Trained without a stop."""
+    return train(module_of(tiny_scene), tmp_path_factory.mktemp("whole"))
+
+
 # 5: between densifications, statistics half gathered; 8: right after one; 13: after the reset; 17: after a degree joined.
 @pytest.mark.parametrize("stop", with_slow([5, 8, 13, 17], [8, 17]))
 @pytest.mark.usefixtures("unchecked")
 def test_resume_is_bit_identical_to_never_having_stopped(
-    tiny_scene: Scene, tmp_path: Path, stop: int
+    tiny_scene: Scene, whole: VLGSModule, tmp_path: Path, stop: int
 ):
-    whole = train(module_of(tiny_scene), tmp_path / "whole")
     first = module_of(tiny_scene)
     stop_at(first, stop)
     train(first, tmp_path / "parts")
@@ -94,6 +99,9 @@ def test_resume_is_bit_identical_to_never_having_stopped(
     )
     assert_same_bits(whole, second)
 
+
+ONCE = "trainer.iterations=13"
+"""Through everything in `SCHEDULE` once: densifies at 4 and 8, resets at 12."""
 
 CHOSEN = ("gaussians.densify.long_axis=true", "gaussians.densify.by_error=true")
 """How everyday trainers densify."""
@@ -148,7 +156,7 @@ def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
         modules = []
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            modules.append(train(module_of(tiny_scene, *CHOSEN), tmp_path / str(count)))
+            modules.append(train(module_of(tiny_scene, *CHOSEN, ONCE), tmp_path / str(count)))
     finally:
         torch.set_num_threads(threads)
     assert_same_bits(modules[0], modules[1])
@@ -157,7 +165,7 @@ def test_the_same_seed_gives_the_same_bits_for_any_number_of_threads(
 
 @pytest.mark.usefixtures("unchecked")
 def test_training_lowers_the_loss(tiny_scene: Scene, tmp_path: Path):
-    module = module_of(tiny_scene, "trainer.iterations=80")
+    module = module_of(tiny_scene, "trainer.iterations=40")
     losses = []
     original = module.training_step
 
@@ -284,8 +292,8 @@ def test_a_view_that_sees_nothing_trains_on(tiny_scene: Scene, tmp_path: Path):
         else view
         for i, view in enumerate(tiny_scene.train)
     )
-    module = train(module_of(replace(tiny_scene, train=blind)), tmp_path)
-    assert module.next_step == 24
+    module = train(module_of(replace(tiny_scene, train=blind), ONCE), tmp_path)
+    assert module.next_step == 13
     assert module.model.splats["means"].isfinite().all()
 
 
@@ -296,7 +304,7 @@ def test_a_scene_without_language_trains_colour_only(tiny_scene: Scene, tmp_path
         mask_areas=torch.zeros(0),
         train=tuple(replace(view, read_masks=None) for view in tiny_scene.train),
     )
-    module = train(module_of(silent), tmp_path)
+    module = train(module_of(silent, ONCE), tmp_path)
     assert module.skips.done("blended render") == 0
     assert torch.equal(
         module.model.splats["features"], torch.zeros_like(module.model.splats["features"])
@@ -310,14 +318,15 @@ def test_no_training_views_is_refused(tiny_scene: Scene):
 
 def test_one_view_is_enough(tiny_scene: Scene, tmp_path: Path):
     alone: tuple[View, ...] = tiny_scene.train[:1]
-    assert train(module_of(replace(tiny_scene, train=alone)), tmp_path).next_step == 24
+    assert train(module_of(replace(tiny_scene, train=alone), ONCE), tmp_path).next_step == 13
 
 
 @pytest.mark.parametrize("blend", ["blend=none", "loss.blended_view.weight=0.0"])
+@pytest.mark.usefixtures("unchecked")
 def test_a_blended_view_without_weight_is_not_rendered(
     tiny_scene: Scene, tmp_path: Path, blend: str
 ):
-    module = train(module_of(tiny_scene, blend), tmp_path)
+    module = train(module_of(tiny_scene, blend, ONCE), tmp_path)
     assert module.skips.done("blended render") == 0
 
 
@@ -328,32 +337,33 @@ def test_similarity_is_computed_once_per_pair_and_symmetric(tiny_scene: Scene):
     assert 0 <= module.views.similarity(1, 4) <= 1
 
 
-@pytest.mark.parametrize(
-    "axes",
-    [
-        ["fusion=none", "indicator=opacity", "blend=none"],
-        ["fusion=mlp", "indicator=fixed", "blend=fixed"],
-        ["fusion=cross", "blend=gaussian", "blend.convention=paper"],
-        ["blend=uniform", "blend.rotation=false", "loss.photometric.error=l1_dssim"],
-        ["gaussians.densify_on=rgb", "gaussians.prune_on=opacity", "gaussians.sh_degree=0"],
-        ["gaussians.color=rgb", "gaussians.prune_on=indicator", "blend.mask=or"],
-        ["gaussians.color=evaluated", "blend.pairs=neighbours", "trainer.means_steps=30000"],
-        ["gaussians.init_features=lifted", "blend.kept=nearer", "blend.rotation=false"],
-        ["sharing=pos", "gaussians.densify.reset_indicator=true", "indicator=opacity"],
-        ["sharing=pos", "indicator=opacity", *CHOSEN],
-        ["gaussians.color=evaluated", "trainer.exposure=true", *CHOSEN],
-        ["gaussians.densify.share_weights=true", "gaussians.background=0", CHOSEN[1]],
-    ],
-    ids=" ".join,
+AXES = (
+    ["fusion=none", "indicator=opacity", "blend=none"],
+    ["fusion=mlp", "indicator=fixed", "blend=fixed"],
+    ["fusion=cross", "blend=gaussian", "blend.convention=paper"],
+    ["blend=uniform", "blend.rotation=false", "loss.photometric.error=l1_dssim"],
+    ["gaussians.densify_on=rgb", "gaussians.prune_on=opacity", "gaussians.sh_degree=0"],
+    ["gaussians.color=rgb", "gaussians.prune_on=indicator", "blend.mask=or"],
+    ["gaussians.color=evaluated", "blend.pairs=neighbours", "trainer.means_steps=30000"],
+    ["gaussians.init_features=lifted", "blend.kept=nearer", "blend.rotation=false"],
+    ["sharing=pos", "gaussians.densify.reset_indicator=true", "indicator=opacity"],
+    ["sharing=pos", "indicator=opacity", *CHOSEN],
+    ["gaussians.color=evaluated", "trainer.exposure=true", *CHOSEN],
+    ["gaussians.densify.share_weights=true", "gaussians.background=0", CHOSEN[1]],
 )
+LIKE_OTHERS = (*AXES[1:4], AXES[5], AXES[7], AXES[9])
+"""All of whose values some other test trains, or stand beside another one's of the same parts."""
+
+
+@pytest.mark.parametrize("axes", with_slow(AXES, LIKE_OTHERS), ids=" ".join)
 def test_points_on_the_axes_train(tiny_scene: Scene, tmp_path: Path, axes: list[str]):
-    module = train(module_of(tiny_scene, *axes), tmp_path)
+    module = train(module_of(tiny_scene, *axes, ONCE), tmp_path)
     assert all(p.isfinite().all() for p in module.model.parameters())
 
 
 def test_only_trained_modalities_move(tiny_scene: Scene, tmp_path: Path):
     """indicator=opacity gives the indicator no gradient: Adam must leave it where it started."""
-    module = module_of(tiny_scene, "indicator=opacity", "gaussians.densify.start=100")
+    module = module_of(tiny_scene, "indicator=opacity", "gaussians.densify.start=100", ONCE)
     before = module.model.splats["indicator_logits"].detach().clone()
     train(module, tmp_path)
     assert torch.equal(module.model.splats["indicator_logits"].detach(), before)
