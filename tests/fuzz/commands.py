@@ -48,6 +48,8 @@ def command(name: str, arguments: Sequence[str]) -> Said:
     GlobalHydra.instance().clear()
     sys.argv = [f"vlgs.{name}", *arguments]
     told, status = io.StringIO(), 0
+    loader = logging.getLogger("vlgs.data.colmap")
+    level = loader.level
     with _captured(told):
         try:
             COMMANDS[name]()
@@ -55,6 +57,8 @@ def command(name: str, arguments: Sequence[str]) -> Said:
             status = stop.code if isinstance(stop.code, int) else int(bool(stop.code))
             if isinstance(stop.code, str):
                 told.write(f"{stop.code}\n")
+        finally:
+            loader.setLevel(level)  # check lowers it for its process
     return Said(status, told.getvalue())
 
 
