@@ -113,19 +113,9 @@ def test_recipes_beside_the_first_take_turns_with_it(
     turns: list[tuple[int | str, ...]] = []
     monkeypatch.setattr(unseen, "_row", skip)
     monkeypatch.setattr(unseen, "draw_unseen", lambda *_: None)
-    command = ["unseen", "--scenes", "mirrors_sky", "--views", "4", "--seeds", "0", "1", "--recipe", "one"]  # fmt: skip
-    command += [
-        "--override",
-        "a=1",
-        "--beside",
-        "two",
-        "a=2",
-        "b=3",
-        "--beside",
-        "c=4",
-        "c=4",
-        "--out",
-    ]
+    command = ["unseen", "--scenes", "mirrors_sky", "--views", "4", "--seeds", "0", "1"]
+    command += ["--recipe", "one", "--override", "a=1", "--beside", "two", "a=2", "b=3"]
+    command += ["--beside", "c=4", "c=4", "--out"]
     assert main([*command, str(tmp_path)]) == 0
     once = [("one", "a=1"), ("two", "a=2", "b=3"), ("c=4", "c=4")]
     assert turns == [(seed, *recipe) for seed in (0, 1) for recipe in once]

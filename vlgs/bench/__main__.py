@@ -144,27 +144,18 @@ def unseen(parser: ArgumentParser) -> Runner:
     parser.add_argument("--splits", nargs="+", help="of them: every 8th, a tenth; default: both")
     parser.add_argument("--recipe", default="default", help="a name for what --override changes")
     parser.add_argument("--override", nargs="+", default=[], metavar="KEY=VALUE")
-    parser.add_argument(
-        "--beside", nargs="+", action="append", default=[], metavar=("NAME", "KEY=VALUE"),
-        help="another recipe, trained in turns with the first; may be given again",
-    )  # fmt: skip
+    parser.add_argument("--beside", nargs="+", action="append", default=[], metavar=("NAME", "KEY=VALUE"), help="another recipe, trained in turns with the first; may be given again")  # fmt: skip
     parser.add_argument("--train-threads", type=int, default=1)
 
     def run(args: Namespace) -> int:
-        from vlgs.bench.unseen import PHOTOGRAPHS, PROCEDURAL, SPLITS, make_tasks, run_unseen
+        from vlgs.bench import unseen as yardstick
 
-        scenes = args.scenes or [*PROCEDURAL, *PHOTOGRAPHS]
+        scenes = args.scenes or [*yardstick.PROCEDURAL, *yardstick.PHOTOGRAPHS]
         views, seeds = ([4], [args.seed]) if args.quick else (args.views, args.seeds)
-        splits = args.splits or SPLITS
-        tasks = make_tasks(scenes, views, args.root, args.resize, args.quick, splits)
-        recipes = {args.recipe: args.override}
-        for name, *overrides in args.beside:
-            if name in recipes or not overrides:
-                raise ValueError(
-                    f"bench: --beside needs a name of its own and what it changes, got {name!r}"
-                )
-            recipes[name] = overrides
-        run_unseen(tasks, recipes, seeds, args.out, args.train_threads)
+        splits = args.splits or yardstick.SPLITS
+        tasks = yardstick.make_tasks(scenes, views, args.root, args.resize, args.quick, splits)
+        recipes = yardstick.recipes_of(args.recipe, args.override, args.beside)
+        yardstick.run_unseen(tasks, recipes, seeds, args.out, args.train_threads)
         return 0
 
     return run

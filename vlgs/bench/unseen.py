@@ -92,6 +92,24 @@ def make_tasks(
     return tasks
 
 
+def recipes_of(
+    name: str, overrides: Sequence[str], beside: Sequence[Sequence[str]]
+) -> dict[str, Sequence[str]]:
+    """Label -> overrides, of the first recipe and of those beside it, each a name and what it changes.
+
+    Raises:
+        ValueError: If one beside it has another's name or changes nothing.
+    """
+    recipes = {name: overrides}
+    for label, *changes in beside:
+        if label in recipes or not changes:
+            raise ValueError(
+                f"bench: --beside needs a name of its own and what it changes, got {label!r}"
+            )
+        recipes[label] = changes
+    return recipes
+
+
 def run_unseen(
     tasks: Sequence[Task],
     recipes: Mapping[str, Sequence[str]],
