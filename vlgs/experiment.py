@@ -21,7 +21,7 @@ from vlgs.metrics.protocol import Auto, EvaluationProtocol
 from vlgs.places import record
 from vlgs.queries import Query, TextEncoder
 from vlgs.training.augment import Augment
-from vlgs.training.build import Parts
+from vlgs.training.build import Parts, scaled
 from vlgs.training.levels import LEVEL_OPTIONS, Levels
 from vlgs.training.stages import Method, Stages
 from vlgs.types import Scene
@@ -146,7 +146,7 @@ def _make_parts(config: DictConfig) -> Parts:
     torch.manual_seed(config.seed)
     parts = Parts(**{field.name: instantiate(config[field.name]) for field in fields(Parts)})
     terms = {name: term for name, term in parts.loss.items() if term is not None}
-    return replace(parts, loss=terms)
+    return scaled(replace(parts, loss=terms), parts.trainer.steps_scaler, interval=True)
 
 
 def _method(config: DictConfig) -> Method | None:

@@ -119,6 +119,7 @@ AS_WITHOUT: Mapping[str, Any] = {
     "trainer.language_decay": 1,
     "trainer.learning_rates.exposure": 1e-3,
     "trainer.rates_for": None,
+    "trainer.steps_scaler": 1,
 }
 """Key -> the value with which everything is as if there were no such key. For keys that come after others have runs, or that go while
 they have; the default may be another. What stands in a list counts without its number. An entry stays as it is for as long as the key is there, since changing it gives all runs other ids."""

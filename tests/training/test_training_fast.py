@@ -3,7 +3,7 @@
 import gc
 import weakref
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from slow import with_slow
 from tiny_runs import TINY, composed
 
 from vlgs.config import instantiate
+from vlgs.experiment import construct
 from vlgs.objectives.targets import TrainingViews
 from vlgs.runs import RunFolder
 from vlgs.training.build import Parts, build_module
@@ -149,9 +150,43 @@ def test_rates_made_for_another_budget_grow_by_the_root(tiny_scene: Scene):
     assert TrainerConfig(16, LearningRates(means_final=0.0), rates_for=16).pace == 1
 
 
+def test_a_scaled_budget_is_the_one_that_is_written_out():
+    written = (
+        "trainer.iterations=3040",
+        "trainer.sh_every=608",
+        "gaussians.densify.start=202",
+        "gaussians.densify.stop=2026",
+        "gaussians.densify.every=122",
+    )
+    by_hand = construct(composed("trainer=fast_photos", *written)).make_parts()
+    asked = construct(composed("trainer=fast_photos", "trainer.steps_scaler=2.0"))
+    for parts in (asked.parts, asked.make_parts()):
+        trainer = replace(parts.trainer, steps_scaler=1.0)
+        assert (trainer, parts.gaussians) == (by_hand.trainer, by_hand.gaussians)
+    small = construct(composed("trainer=paper", "trainer.steps_scaler=0.001")).parts
+    assert small.trainer.iterations == 15
+    assert small.gaussians.densify.every == 1  # not never
+
+
+def test_a_scaled_budget_is_what_is_trained(tiny_scene: Scene):
+    experiment = construct(composed(*TINY, "trainer=smoke", *LESS, "trainer.steps_scaler=0.5"))
+    module = build_module(tiny_scene, experiment.make_parts(), experiment.seed)
+    densify = module.densifying.config.densify
+    assert (module.settings.iterations, densify.start, densify.stop) == (8, 1, 8)
+    assert module.settings.is_half_size(3)
+    assert not module.settings.is_half_size(4)
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("color_decay", 1.5), ("rates_for", 0), ("half_size", -0.1), ("half_size", 1.1)],
+    [
+        ("color_decay", 1.5),
+        ("rates_for", 0),
+        ("half_size", -0.1),
+        ("half_size", 1.1),
+        ("steps_scaler", 0.0),
+        ("steps_scaler", float("nan")),
+    ],
 )
 def test_what_cannot_be_is_refused_by_name(key: str, value: float):
     with pytest.raises(ValueError, match=f"trainer: {key} must be"):

@@ -56,8 +56,14 @@ class Parts:
             )
 
 
-def scaled(parts: Parts, share: float) -> Parts:
-    """The parts with a share of the iterations: what is said in iterations from the start shrinks or grows alike, intervals of densification stay."""
+def scaled(parts: Parts, share: float, interval: bool = False) -> Parts:
+    """The parts with a share of the iterations: what is said in iterations from the start shrinks or grows alike.
+
+    Args:
+        parts: The parts.
+        share: Factor of the iterations.
+        interval: Whether there are as many densifications as before, further apart, and not as many in a hundred iterations.
+    """
     if share == 1:
         return parts
     trainer, densify = parts.trainer, parts.gaussians.densify
@@ -75,6 +81,7 @@ def scaled(parts: Parts, share: float) -> Parts:
         densify,
         start=of(densify.start, 0),
         stop=of(densify.stop, 0),
+        every=of(densify.every) if interval else densify.every,
         reset_every=of(densify.reset_every) if densify.reset_every else 0,
     )
     return replace(parts, trainer=trainer, gaussians=replace(parts.gaussians, densify=densify))

@@ -105,6 +105,8 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
+    steps_scaler: float = 1.0
+    """Factor of all that a run says in iterations, densification included (`vlgs.training.build.scaled`), but of logs and checkpoints: gsplat's."""
     log_every: int = 50
     checkpoint_every: int = 1000
     """Iterations between checkpoints; 0 writes one only at the end."""
@@ -138,6 +140,7 @@ class TrainerConfig:
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
         shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
+        require_range("trainer", 1e-4, 1e4, steps_scaler=self.steps_scaler)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
         if self.rates_for is not None:
