@@ -68,6 +68,8 @@ SAID_ELSEWHERE = frozenset(
         "language_weight",
         "language_error",
         "language_support",
+        "best_rates_for",
+        "best_shN",
     )
 )
 """Keys that move a number through a key of another group alone, which counts: parts that do not read them have one id with any value."""

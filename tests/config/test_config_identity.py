@@ -164,9 +164,8 @@ AS_PAPER = (
 
 
 def test_what_a_trainer_says_for_other_groups_counts_through_these():
-    assert {
-        f"trainer.{one.partition('=')[0].partition('.')[2]}" for one in AS_PAPER
-    } == SAID_ELSEWHERE
+    of_language = {one.partition("=")[0] for one in AS_PAPER}
+    assert of_language | {"trainer.best_rates_for", "trainer.best_shN"} == SAID_ELSEWHERE
     assert all(moves(key) for key in SAID_ELSEWHERE), "a benchmark records them"
     own = (
         *("head.training.spread=32", "head.training.faint=0.35"),
@@ -179,6 +178,19 @@ def test_what_a_trainer_says_for_other_groups_counts_through_these():
     assert ids(composed("method=best")) == ids(composed("method=best", *AS_PAPER))
     for trainer in ("paper", "benchmark", "released"):
         assert ids(composed(f"trainer={trainer}")) == ids(composed(f"trainer={trainer}", *AS_PAPER))
+
+
+def test_rates_that_a_trainer_says_for_best_count_with_it_alone():
+    said = ("trainer.best_rates_for=7", "trainer.best_shN=0.25")
+    given = ("trainer.rates_for=7", "trainer.learning_rates.shN=0.25")
+    assert ids(composed(*said)) == ids(composed())
+    assert ids(composed("method=best", *said)) == ids(composed("method=best", *given))
+    assert ids(composed("method=best", *said)) != ids(composed("method=best"))
+    own, best = (
+        composed("trainer=photos").trainer,
+        composed("trainer=photos", "method=best").trainer,
+    )
+    assert (own.rates_for, own.learning_rates) == (best.rates_for, best.learning_rates)
 
 
 def test_what_moves_nothing_and_what_may_be_left_out_are_keys_that_are_there(

@@ -116,7 +116,7 @@ class TrainerConfig:
     """Whether every training photograph has a gain, white balance and offset of its own (`vlgs.training.exposure`)."""
     skip: SkipConfig = field(default_factory=SkipConfig)
     codes_apart: int = 0
-    """What ``head.training.spread`` is unless given. This and the next five belong to other parts, but whether they are the paper's goes with the budget, as all else
+    """What ``head.training.spread`` is unless given. This and the next seven belong to other parts, but whether they are the paper's goes with the budget, as all else
     that is not: those of the tables are, those for everyday use are not."""
     codes_faint: float = 0.0
     """What ``head.training.faint`` is unless given."""
@@ -128,6 +128,10 @@ class TrainerConfig:
     """What ``loss.language.error`` is unless given, likewise."""
     language_support: float = 0.0
     """What ``loss.language.support`` is unless given, likewise."""
+    best_rates_for: int = 15_000
+    """What `rates_for` is with ``method=best`` unless given."""
+    best_shN: float = 5e-4  # noqa: N815 (as in `LearningRates`)
+    """What `LearningRates.shN` is, likewise."""
 
     def __post_init__(self) -> None:
         require_range("trainer", 1, MOST_ITERATIONS, iterations=self.iterations)
