@@ -68,6 +68,30 @@ def files_of_options_parsed_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def configurations_copied_at_once() -> Iterator[None]:
+    """Hydra copies a configuration for everything that it makes of one, node by node; pickle takes a third of that."""
+    from omegaconf import DictConfig
+
+    node_by_node = DictConfig.__deepcopy__
+
+    def at_once(self: DictConfig, memo: dict[int, Any]) -> DictConfig:
+        parent = self.__dict__["_parent"]
+        self.__dict__["_parent"] = None
+        try:
+            copied = pickle.loads(pickle.dumps(self, pickle.HIGHEST_PROTOCOL))
+        except (pickle.PicklingError, AttributeError, TypeError):  # it holds what cannot be pickled
+            return node_by_node(self, memo)
+        finally:
+            self.__dict__["_parent"] = parent
+        copied.__dict__["_parent"] = parent
+        return copied
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DictConfig, "__deepcopy__", at_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def interpolations_parsed_once() -> Iterator[None]:
     """Every configuration has the same few dozen of them; the tree of a text is only read."""
     from omegaconf import grammar_parser
@@ -149,7 +173,16 @@ def traced_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     base = tmp_path_factory.getbasetemp()
     common = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    original = capture._photographs
+    original, taken = capture._photographs, capture._taken
+
+    def taken_unchecked(world: Any, cameras: Any, settings: Any) -> Any:
+        """A third of the time would be checks of types; tests of the tracer itself call it directly."""
+        before = jaxtyping.config.jaxtyping_disable
+        jaxtyping.config.update("jaxtyping_disable", True)
+        try:
+            return taken(world, cameras, settings)
+        finally:
+            jaxtyping.config.update("jaxtyping_disable", before)
 
     def photographs(world: Any, cameras: Any, settings: Any, cache: Path | None) -> Any:
         if cache is None:
@@ -167,6 +200,7 @@ def traced_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(capture, "_photographs", photographs)
+        patch.setattr(capture, "_taken", taken_unchecked)
         yield
 
 
