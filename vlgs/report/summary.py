@@ -28,7 +28,7 @@ _ROWS = (
     ("peak_rss_bytes", "peak memory", "{:,} MB"),
     ("fps_color", "colour render", "{:.1f} /s"),
     ("fps_language", "language render", "{:.1f} /s"),
-    ("fps_query", "query", "{:.1f} /s"),
+    ("fps_query", "query, every pixel decoded", "{:.1f} /s"),
 )
 _SILENT = ("lpips",)  # never available, which metrics.json says
 _ALWAYS = ("psnr", "ssim", "miou", "loc_acc")
