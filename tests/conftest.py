@@ -74,15 +74,18 @@ def configurations_copied_at_once() -> Iterator[None]:
 
     node_by_node = DictConfig.__deepcopy__
 
-    def at_once(self: DictConfig, memo: dict[int, Any]) -> DictConfig:
-        parent = self.__dict__["_parent"]
-        self.__dict__["_parent"] = None
+    def at_once(self: Any, memo: dict[int, Any]) -> Any:
+        inside, parent = self.__dict__, self.__dict__["_parent"]
+        inside["_parent"] = None  # it is kept and not copied
         try:
-            copied = pickle.loads(pickle.dumps(self, pickle.HIGHEST_PROTOCOL))
+            text = pickle.dumps(self, pickle.HIGHEST_PROTOCOL)
         except (pickle.PicklingError, AttributeError, TypeError):  # it holds what cannot be pickled
-            return node_by_node(self, memo)
+            text = b""
         finally:
-            self.__dict__["_parent"] = parent
+            inside["_parent"] = parent
+        if not text:
+            return node_by_node(self, memo)
+        copied = pickle.loads(text)
         copied.__dict__["_parent"] = parent
         return copied
 
