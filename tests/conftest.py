@@ -1,5 +1,6 @@
 """What several areas need: a small procedural scene, read once, and the folder of real data."""
 
+import contextlib
 import dataclasses
 import functools
 import gc
@@ -41,6 +42,17 @@ def pytest_collection_finish() -> None:
     """From here on garbage is looked for among what tests make, not among all that was imported for them."""
     gc.freeze()
     gc.enable()
+
+
+@contextlib.contextmanager
+def checks_of_types(on: bool) -> Iterator[None]:
+    """Whether values are held against the types and shapes of signatures."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", not on)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -180,12 +192,8 @@ def traced_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     def taken_unchecked(world: Any, cameras: Any, settings: Any) -> Any:
         """A third of the time would be checks of types; tests of the tracer itself call it directly."""
-        before = jaxtyping.config.jaxtyping_disable
-        jaxtyping.config.update("jaxtyping_disable", True)
-        try:
+        with checks_of_types(False):
             return taken(world, cameras, settings)
-        finally:
-            jaxtyping.config.update("jaxtyping_disable", before)
 
     def photographs(world: Any, cameras: Any, settings: Any, cache: Path | None) -> Any:
         if cache is None:
@@ -254,19 +262,15 @@ WHOLE_RUNS = frozenset(
 @pytest.fixture(scope="module", autouse=True)
 def types_are_checked_in_parts(request: pytest.FixtureRequest) -> Iterator[None]:
     """Checks of types and shapes take two fifths of a training run: where whole runs are tested they are off, tests of their parts have them."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in WHOLE_RUNS)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
+    with checks_of_types(request.path.parent.name not in WHOLE_RUNS):
+        yield
 
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Likewise for a test that trains or traces the same several times, what its neighbours do once with checks."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
+    with checks_of_types(False):
+        yield
 
 
 @pytest.fixture(scope="session")
