@@ -320,16 +320,18 @@ inline void gaussian_wide(const Tile<T> &tile, const T *g, uint32_t blocks, T *s
 
 template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
-  if (tile.pass->narrow && tile.pass->num_parts == kChains)
-    gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
-  else if (tile.pass->narrow)
+  if (!tile.pass->narrow)
+    gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+  else if (kChains == kNarrowParts || tile.pass->num_parts > kChains)
     gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
   else
-    gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+    gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
 }
 
 template <class T, int kChains, Need kNeed>
 void rasterize_tile_backward(const Tile<T> &given, T *slots) {
+  // A clamp that does not bind moves no bit: where all shapes are frozen it is not worth a code without it.
+  constexpr bool kAlwaysClamps = kNeed != Need::kShape;
   const Tile<T> tile = given;  // a copy that no store can reach stays in registers
   const Pass<T> &p = *tile.pass;
   Live live = live_blocks(tile);
@@ -337,14 +339,14 @@ void rasterize_tile_backward(const Tile<T> &given, T *slots) {
     const uint32_t blocks = p.masks[tile.begin + place] & live.at(place);
     T *slot = slots + place * p.slot_size;
     const T *g = tile.records + place * kRecord;
-    bool clamps = false;
+    bool clamps = kAlwaysClamps;
     for (int c = 0; c < kChains; ++c) clamps |= g[kChains0 + 2 * c + kWeight] > tile.alpha_max;
     if (!blocks)
       for (int64_t i = 0; i < p.slot_size; ++i) slot[i] = 0;
     else if (clamps)
       gaussian<T, kChains, kNeed, true>(tile, g, blocks, slot);
     else
-      gaussian<T, kChains, kNeed, false>(tile, g, blocks, slot);
+      gaussian<T, kChains, kNeed, kAlwaysClamps>(tile, g, blocks, slot);
   }
 }
 
