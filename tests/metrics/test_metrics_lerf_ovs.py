@@ -73,7 +73,7 @@ def slow_unit(levels: np.ndarray, mask: np.ndarray, boxes: np.ndarray) -> tuple[
     return float(iou), bool(hit)
 
 
-@pytest.mark.parametrize("seed", with_slow(range(4), (2, 3)))
+@pytest.mark.parametrize("seed", with_slow(range(4), (1, 2, 3)))
 @pytest.mark.parametrize("levels", [1, 2])
 def test_unit_agrees_with_the_slow_loop(seed: int, levels: int):
     rng = np.random.default_rng(seed)

@@ -12,6 +12,7 @@ import pytest
 import torch
 import yaml
 from safetensors.torch import load_file
+from slow import with_slow
 from tiny_runs import TINY, composed
 from torch import Tensor
 
@@ -80,7 +81,7 @@ def test_a_field_that_answers_for_all_mask_levels_has_none_to_choose(opened: Ope
         taught.place(2)
 
 
-@pytest.mark.parametrize("levels", ["separate", "joint"])
+@pytest.mark.parametrize("levels", with_slow(["separate", "joint"], ["separate"]))
 def test_several_mask_levels_come_back(tmp_path: Path, levels: str):
     config = composed(*TINY, "trainer=smoke", "trainer.iterations=2", f"levels={levels}", "pictures=false", f"results={tmp_path}")  # fmt: skip
     assert run(config) == 0

@@ -48,7 +48,7 @@ def metrics_of(folder: RunFolder) -> dict:
 
 
 @pytest.mark.parametrize(
-    "kind", with_slow(KINDS, set(KINDS) - {"levels=joint", "joint, an indicator for each level"})
+    "kind", with_slow(KINDS, set(KINDS) - {"joint, an indicator for each level"})
 )
 def test_every_model_has_a_folder_and_the_run_one_result(tmp_path: Path, kind: str):
     overrides, stages = KINDS[kind]
