@@ -63,6 +63,7 @@ def test_bounds_and_targets_are_of_as_many_threads():
             assert known.bound < two < one
 
 
+@pytest.mark.slow
 def test_growth_has_slopes_within_a_series(tmp_path: Path):
     points = [Point("gaussians", n, n, 16, 12, 3, 1) for n in (20, 40)]
     points += [Point("channels", c, 20, 16, 12, c, 1) for c in (1, 4)]

@@ -187,6 +187,7 @@ def test_error_and_pareto_write_their_files(tmp_path: Path, w: Workload):
     assert points.groupby(["scene", "truth"]).front_worst_gradient.any().all()
 
 
+@pytest.mark.slow
 def test_a_broken_bound_is_status_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

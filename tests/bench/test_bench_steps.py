@@ -115,6 +115,7 @@ def test_the_detour_of_a_blended_camera_is_its_ratio():
     assert steps._detour(between, between, first, second) == 0
 
 
+@pytest.mark.slow
 def test_rows_go_into_a_file_of_their_own(
     tmp_path: Path, trained: Trained, monkeypatch: pytest.MonkeyPatch
 ):

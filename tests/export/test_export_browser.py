@@ -62,7 +62,7 @@ KINDS = {
 """How the scene of a page was trained; at 3.8 units the near plane cuts through the nearer ball."""
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(scope="module", params=with_slow(KINDS, ["one shape"]))
 def shown(
     request: pytest.FixtureRequest, browser: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Shown]:
