@@ -322,7 +322,8 @@ template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   if (!tile.pass->narrow)
     gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
-  else if (kChains == kNarrowParts || tile.pass->num_parts > kChains)
+  else if (kChains == kNarrowParts ||
+           tile.pass->num_parts > kChains)  // two chains: one code, not the same twice
     gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
   else
     gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
