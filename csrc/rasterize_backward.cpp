@@ -322,11 +322,10 @@ template <class T, int kChains, Need kNeed, bool kClamp>
 VLGS_INLINE void gaussian(const Tile<T> &tile, const T *g, uint32_t blocks, T *slot) {
   if (!tile.pass->narrow)
     gaussian_wide<T, kChains, kNeed, kClamp>(tile, g, blocks, slot);
-  else if (kChains == kNarrowParts ||
-           tile.pass->num_parts > kChains)  // two chains: one code, not the same twice
-    gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
+  else if (kChains == 1 && tile.pass->num_parts == 1)
+    gaussian_narrow<T, 1, 1, kNeed, kClamp>(tile, g, blocks, slot);
   else
-    gaussian_narrow<T, kChains, kChains, kNeed, kClamp>(tile, g, blocks, slot);
+    gaussian_narrow<T, kChains, kNarrowParts, kNeed, kClamp>(tile, g, blocks, slot);
 }
 
 template <class T, int kChains, Need kNeed>

@@ -14,20 +14,19 @@ from vlgs.ablate import warm
 from vlgs.ablate.warm import WarmParent
 
 SAMPLES = {
-    "files": ("--count", "8"),
+    "files": ("--count", "14"),
     "bombs": ("--every", "33"),
     "paths": ("--count", "42", "--every", "6"),
     "places": ("--every", "80"),
-    "text": ("--every", "26", "--count", "0"),
-    "results": ("--every", "70", "--count", "0"),
-    "scene_files": ("--every", "6", "--count", "15"),
+    "text": ("--every", "13", "--count", "0"),
+    "results": ("--every", "40", "--count", "0"),
+    "scene_files": ("--every", "5", "--count", "18"),
 }
 LARGER = {
     "files": ("--count", "40"),
     "bombs": ("--every", "12"),
     "paths": ("--count", "42"),
     "places": ("--every", "16"),
-    "text": ("--every", "13", "--count", "0"),
     "results": ("--every", "13", "--count", "0"),
     "scene_files": ("--count", "30"),
 }
