@@ -55,7 +55,8 @@ def meet(parent: WarmParent, family: str, options: tuple[str, ...], least: int, 
     assert tried == right > least
 
 
-@pytest.mark.parametrize("family", with_slow(SAMPLES, ["paths"]))
+# Each starts anew, for seconds whatever the size of its sample; files are what strangers hand over most.
+@pytest.mark.parametrize("family", with_slow(SAMPLES, [f for f in SAMPLES if f != "files"]))
 def test_a_sample_of_the_attacks_is_met_rightly(family: str, parent: WarmParent, tmp_path: Path):
     meet(parent, family, SAMPLES[family], 4, tmp_path / "log")
 
