@@ -46,6 +46,16 @@ def test_statistic_is_the_mean_length_over_views_in_ndc():
     torch.testing.assert_close(state.mean(), torch.tensor([0.2, 0.05, 0.0]))
 
 
+@pytest.mark.parametrize(
+    ("full_to", "factor"), [(0.0, 1.0), (300.0, 1.0), (200.0, 1.0), (100.0, 2**0.5), (50.0, 2.0)]
+)
+def test_gradients_of_views_above_a_size_count_by_the_root_of_it(full_to: float, factor: float):
+    state = DensifyState.zeros(1)
+    seen, gradient = torch.tensor([True]), torch.tensor([[3e-3, 0.0]])
+    state.accumulate(gradient, seen, width=400, height=100, full_to=full_to)
+    torch.testing.assert_close(state.mean(), torch.tensor([0.6 * factor]))
+
+
 @pytest.mark.parametrize("options", ADAM, ids=["loop", "foreach", "fused"])
 def test_clones_copy_their_row_and_moments_stay_with_their_gaussians(options: dict):
     params = make(20)

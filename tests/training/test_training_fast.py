@@ -120,6 +120,26 @@ def test_language_that_has_a_shape_of_its_own_learns_it_as_colour_does(tiny_scen
     assert rates["language_quats"] == rates["quats"]
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_large_views_make_more_gaussians_where_thresholds_fall_with_their_size(
+    tiny_scene: Scene, tmp_path: Path
+):
+    def count(size: float) -> int:
+        """After the first densification, of a run on views of 48x36, 41.6 pixels."""
+        size_override = f"gaussians.densify.grad_threshold_size={size}"
+        once = (
+            "trainer.iterations=6",
+            "trainer.half_size=0",
+            "gaussians.densify.grad_threshold=1e-3",
+        )
+        module = trained(tiny_scene, tmp_path / str(size), *LESS, *once, size_override)
+        return module.model.count
+
+    whatever = count(0.0)
+    assert count(42.0) == whatever
+    assert count(0.1) > whatever
+
+
 def test_a_count_that_is_full_is_told_once(
     tiny_scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):

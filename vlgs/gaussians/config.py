@@ -26,6 +26,9 @@ class DensifyConfig:
     """Steps between two densifications."""
     grad_threshold: float = 2e-4
     """A Gaussian whose mean screen gradient reaches this, in NDC units, is cloned or split."""
+    grad_threshold_size: float = 0.0
+    """Up to views of this size, the root of width times height in pixels, `grad_threshold` holds as it is; of larger ones it is divided by the
+    root of the excess. 0: whatever their size. See `DensifyState.accumulate`."""
     dense_share: float = 0.01
     """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
     prune_below: float = 0.005
@@ -64,6 +67,7 @@ class DensifyConfig:
             max_scale_share=self.max_scale_share,
         )
         require_range("densify", 0, 10**9, prune_unseen=self.prune_unseen)
+        require_range("densify", 0, 10**9, grad_threshold_size=self.grad_threshold_size)
         _require_inside_unit("densify", prune_below=self.prune_below, reset_to=self.reset_to)
         if self.long_axis and self.share_weights:
             raise ValueError(

@@ -52,7 +52,8 @@ class Densification(AfterStep):
         for camera, gradient, render in zip(
             report.cameras, report.screen_gradients, report.renders, strict=True
         ):
-            state.accumulate(gradient, render.visible, camera.width, camera.height)
+            size = config.densify.grad_threshold_size
+            state.accumulate(gradient, render.visible, camera.width, camera.height, size)
         if last:
             return  # no iteration would train what comes, or bring back what is made transparent
         if config.densify.densifies_at(done):
