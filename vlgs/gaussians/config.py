@@ -27,8 +27,8 @@ class DensifyConfig:
     grad_threshold: float = 2e-4
     """A Gaussian whose mean screen gradient reaches this, in NDC units, is cloned or split."""
     grad_threshold_size: float = 0.0
-    """Up to views of this size, the root of width times height in pixels, `grad_threshold` holds as it is; of larger ones it is divided by the
-    root of the excess. 0: whatever their size. See `DensifyState.accumulate`."""
+    """Up to views of this size, the root of width times height in pixels as they are rendered, `grad_threshold` holds as it is; where they are so
+    many times larger it is divided by the root of that. 0: whatever their size. See `DensifyState.accumulate`."""
     dense_share: float = 0.01
     """Up to this largest scale, as a share of the scene extent, a Gaussian is cloned; above it is split."""
     prune_below: float = 0.005
