@@ -56,14 +56,14 @@ class DensifyState:
         """Add one real view; gradients of several views are never summed before their length is taken (conf/README.md, D.11).
 
         In NDC a detail that fills a fixed share of a photograph has the same gradient whatever the size, one that fills a pixel has it divided by
-        the size: without `full_to` the finer a photograph, the less of what it adds is learned.
+        the size: without `full_to` the finer a photograph, the less of what it adds is learned. The root of the size lies between the two.
 
         Args:
             mean2d_grad: Gradient of the loss with respect to `Rendered.mean2d`, per pixel.
             visible: `Rendered.visible` of the same view.
             width: Of the image in pixels; half of it is one NDC unit.
             height: Likewise.
-            full_to: `DensifyConfig.grad_threshold_size`: gradients of larger views are multiplied by the root of the excess; 0: of none.
+            full_to: `DensifyConfig.grad_threshold_size`: gradients of views so many times larger are multiplied by the root of that; 0: of none.
         """
         half_image = mean2d_grad.new_tensor([width / 2, height / 2])
         if full_to > 0:

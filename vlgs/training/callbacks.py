@@ -49,10 +49,10 @@ class Densification(AfterStep):
         if done >= config.densify.stop:
             return
         state, report = densifying.state, module.report
+        size = config.densify.grad_threshold_size
         for camera, gradient, render in zip(
             report.cameras, report.screen_gradients, report.renders, strict=True
         ):
-            size = config.densify.grad_threshold_size
             state.accumulate(gradient, render.visible, camera.width, camera.height, size)
         if last:
             return  # no iteration would train what comes, or bring back what is made transparent
