@@ -88,6 +88,7 @@ GIVEN_FOLDERS = frozenset({"query.masks", "stages.second.folder"})
 
 AS_WITHOUT: Mapping[str, Any] = {
     "data.faults.shared": 0,
+    "data.train_views": None,
     "gaussians.background": 0,
     "gaussians.background_opacity": None,
     "gaussians.codes": "none",
@@ -117,6 +118,8 @@ AS_WITHOUT: Mapping[str, Any] = {
     "stages": None,
     **dict.fromkeys(("trainer.average_language", "trainer.average_color"), 0),
     "trainer.color_decay": 1,
+    "trainer.dropout": 0,
+    "trainer.dropout_views": 30,
     "trainer.exposure": False,
     "trainer.half_size": 0,
     "trainer.language_decay": 1,

@@ -60,7 +60,7 @@ NAMES = {
 """What classes are called in ids. A name that changes orphans every run that has it."""
 
 IDS = {
-    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse trainer.language_support=0 gaussians.background_opacity=null gaussians.max_angle=0 gaussians.densify.by_error=false gaussians.densify.long_axis=false raster.eps2d=0.3 raster.near_sigmas=0": (
+    "data.scene=mirrors gaussians.near_share=0 trainer.codes_apart=0 trainer.codes_faint=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse trainer.language_support=0 gaussians.background_opacity=null gaussians.max_angle=0 gaussians.densify.by_error=false gaussians.densify.long_axis=false raster.eps2d=0.3 raster.near_sigmas=0 trainer.dropout=0": (
         "cbb48f3055c16f1d",
         "fcbc1c6958b88ef0",
         "3c63531ff24cf4fc",
@@ -70,7 +70,7 @@ IDS = {
         "3c2fbaea7010648d",
         "3c63531ff24cf4fc",
     ),
-    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse trainer.language_support=0 gaussians.background_opacity=null gaussians.max_angle=0 gaussians.densify.by_error=false gaussians.densify.long_axis=false raster.eps2d=0.3 raster.near_sigmas=0": (
+    "data=colmap data.root=here head=identity sharing=pos protocol=lerf_ovs_v2 gaussians.near_share=0 trainer.indicator_reach=0 trainer.language_weight=1 trainer.language_error=mse trainer.language_support=0 gaussians.background_opacity=null gaussians.max_angle=0 gaussians.densify.by_error=false gaussians.densify.long_axis=false raster.eps2d=0.3 raster.near_sigmas=0 trainer.dropout=0": (
         "fa59105e142c0918",
         "42c26c1806e27e11",
         "361e0f7e8b0ed906",
@@ -354,6 +354,7 @@ def test_a_folder_of_second_maps_counts_by_its_content_and_not_by_its_place():
             "gaussians.densify.long_axis=false",
             "raster.eps2d=0.3",
             "raster.near_sigmas=0",
+            "trainer.dropout=0",
             *AS_PAPER,
             *given,
         )

@@ -49,6 +49,7 @@ def test_ids_have_the_old_names():
         "gaussians.densify.long_axis=false",
         "raster.eps2d=0.3",
         "raster.near_sigmas=0",
+        "trainer.dropout=0",
     )
     assert run_id(config, "f") == "22d7fa10565160f3"
     assert identity(config).recipe == "cee97baba7e9d96c"

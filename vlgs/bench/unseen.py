@@ -36,8 +36,8 @@ PROCEDURAL = ("glassware_ring", "mirrors_sky", "lookalikes_wall")
 TRAIN_VIEWS = (12, 20, 40)
 PHOTOGRAPHS = ("fox", "dtu_scan65", "camvid_0016E5")
 """Folders below `--root`; a folder that is not there is left out."""
-SPLITS = ("every 8th", "a tenth")
-"""What is held out of photographs; the tenth is contiguous."""
+SPLITS = ("every 8th", "a tenth", "12 photographs")
+"""What is held out of photographs: the tenth is contiguous; the last are what is trained on, spread over those that every 8th leaves."""
 HELD_OUT = 8
 SIZE = ("data.width=120", "data.height=90")
 QUICK = ("data.width=48", "data.height=36", "data.points=400", "trainer=smoke")  # fmt: skip
@@ -87,6 +87,9 @@ def make_tasks(
             tenth = ",".join(_middle_tenth([*given, "data.split=all"]))
             held_out = ("data.split=list", f"data.test=[{tenth}]")
             tasks.append(Task(scene, "a tenth", (*given, *held_out)))
+        if "12 photographs" in splits:
+            few = ("data.split=llff", "data.train_views=12")
+            tasks.append(Task(scene, "12 photographs", (*given, *few)))
     if not tasks:
         raise ValueError(f"bench: scenes must be at least one that is there, got {list(scenes)}")
     return tasks

@@ -49,6 +49,7 @@ from vlgs.data.sparse import (
     origin_warnings,
     read_sparse,
 )
+from vlgs.data.sparse.tracks import seen_by
 from vlgs.data.views import ViewSource
 from vlgs.types import Scene, Vocabulary
 
@@ -150,8 +151,22 @@ def survey(source: ColmapSource) -> Survey:
     vocabulary = faults.take(_open_vocabulary(source, masks))
     if errors(faults):
         return Survey(tuple(faults), model, views)
+    try:
+        model = _few_points(source, model, views)
+    except SceneError as error:
+        return Survey((*faults, error.fault), model, views)
     scene = _assemble(source, _Parts(model, origin, views, labels, masks, vocabulary))
     return Survey(tuple(faults), model, views, scene)
+
+
+def _few_points(
+    source: ColmapSource, model: SparseModel, views: Sequence[ViewSource]
+) -> SparseModel:
+    """The points that training views saw, where only some train."""
+    if source.train_views is None:
+        return model
+    train = set(source.rule.divide(*_names(views))[0])
+    return seen_by(model, {i.name for i in model.images if Path(i.name).stem in train})
 
 
 def open_training_views(source: ColmapSource, every_view: bool = False) -> tuple[ViewSource, ...]:
@@ -258,12 +273,13 @@ def _assemble(source: ColmapSource, parts: _Parts) -> Scene:
     """The scene of files that are sound."""
     train, test = source.rule.divide(*_names(parts.views))
     bound = parts.masks.sources if parts.masks is not None else {}
-    sources = [bound.get(view.name, view) for view in parts.views]
+    used = {*train, *test}
+    sources = [bound.get(view.name, view) for view in parts.views if view.name in used]
     # A part of them would be found again too seldom to be worth its memory, which it would leave in pieces.
     keep = sum(view.decoded_bytes for view in sources) <= source.cache_bytes
     readable = {view.name: replace(view, keep=keep).view() for view in sources}
     empty = torch.zeros(0, 512 if parts.vocabulary is None else parts.vocabulary.vectors.shape[1])
-    classes, kinds = _classes(parts.labels, {v.name for v in parts.views})
+    classes, kinds = _classes(parts.labels, used)
     return Scene(
         name=source.folder.resolve().name,
         train=tuple(readable[name] for name in train),
@@ -316,6 +332,8 @@ def _fingerprint(source: ColmapSource, parts: _Parts) -> str:
         hasher.update(repr((parts.labels.classes, sorted(marked.items()))).encode())
     if parts.origin != AT_HOME:
         hasher.update(repr(parts.origin).encode())
+    if source.train_views is not None:
+        hasher.update(repr(("train_views", source.train_views)).encode())
     if source.label_set:
         hasher.update(source.label_set.encode())
     for view in parts.views:

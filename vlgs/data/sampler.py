@@ -55,6 +55,10 @@ class PairSampler:
         """The generator that draws the blend ratio of an iteration."""
         return self.rng(3, step)
 
+    def dropout_rng(self, step: int) -> np.random.Generator:
+        """The generator that draws the Gaussians which an iteration leaves out."""
+        return self.rng(4, step)
+
     @cached_property
     def _same_size(self) -> dict[tuple[int, int], list[int]]:
         groups: dict[tuple[int, int], list[int]] = {}

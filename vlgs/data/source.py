@@ -29,6 +29,9 @@ class ColmapSource:
     """Stems of the test views, with split=list."""
     every: int = 8
     """One view of so many is held out, with split=llff."""
+    train_views: int | None = None
+    """Train on so many of the views that are not held out, as if the rest had not been taken: sparse points that fewer than two of them saw are left
+    out, where COLMAP says who saw them."""
     labels: str | None = None
     """Label folder; by default ``<root>/labels`` if there is one."""
     label_names: str = "stem"
@@ -69,7 +72,7 @@ class ColmapSource:
     @property
     def rule(self) -> Split:
         """How the views are divided."""
-        return Split(self.split, tuple(map(str, self.test)), self.every)
+        return Split(self.split, tuple(map(str, self.test)), self.every, self.train_views)
 
 
 def require_tree(source: ColmapSource) -> tuple[Path, str]:

@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from vlgs.data.diagnostics import Fault, listing
 
@@ -15,18 +15,25 @@ class Split:
 
     ``llff``: every `every`-th view in order of name is held out, from the first on. ``holdout``: the labelled views are.
     ``all``: every view trains and the labelled ones are tested as well, as LangSplat does it (conf/README.md, D.22). ``list``: the views
-    of `test` are held out.
+    of `test` are held out. With `train_views` only so many of the others train, spread evenly; the rest is as if it had not been taken.
     """
 
     kind: str = "llff"
     test: tuple[str, ...] = ()
     every: int = 8
+    train_views: int | None = field(
+        default=None, repr=False
+    )  # whoever hashes a split says it apart
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"split: kind must be one of {listing(KINDS)}, got {self.kind!r}")
         if self.every < 2:
             raise ValueError(f"split: every must be at least 2, got {self.every}")
+        if self.train_views is not None and (self.train_views < 1 or self.kind == "all"):
+            raise ValueError(
+                f"split: train_views must be at least 1 and is not for split=all, got {self.train_views} with split={self.kind}"
+            )
         if bool(self.test) != (self.kind == "list"):
             raise ValueError(
                 f"split: test must name views with split=list and only then, got split={self.kind} and "
@@ -36,7 +43,8 @@ class Split:
     @property
     def name(self) -> str:
         """The rule's name, which becomes part of the protocol's name."""
-        return f"llff{self.every}" if self.kind == "llff" else self.kind
+        rule = f"llff{self.every}" if self.kind == "llff" else self.kind
+        return rule if self.train_views is None else f"{rule}-{self.train_views}"
 
     def divide(
         self, names: Sequence[str], labelled: Collection[str]
@@ -48,7 +56,7 @@ class Split:
             held = set(self.test) if self.kind == "list" else set(labelled)
         test = tuple(name for name in names if name in held)
         train = tuple(name for name in names if self.kind == "all" or name not in held)
-        return train, test
+        return _spread(train, self.train_views), test
 
     def faults(
         self, names: Sequence[str], labelled: Collection[str], source: str
@@ -67,3 +75,11 @@ class Split:
                 f"training views must be at least 1, got 0 of {len(names)} with split={self.name}"
             )
             yield Fault(source, what, "choose another split")
+
+
+def _spread(names: tuple[str, ...], count: int | None) -> tuple[str, ...]:
+    """So many of them, from the first to the last; all where there are no more."""
+    if count is None or count >= len(names):
+        return names
+    step = (len(names) - 1) / max(1, count - 1)
+    return tuple(names[round(i * step)] for i in range(count))

@@ -105,6 +105,10 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
+    dropout: float = 0.0
+    """Share of the Gaussians that the last iteration leaves out (`vlgs.training.dropout`), were there no view; others by `dropout_at`."""
+    dropout_views: int = 30
+    """Training views from which on nothing is left out."""
     steps_scaler: float = 1.0
     """Factor of all that a run says in iterations, densification included (`vlgs.training.build.scaled`), but of logs and checkpoints: gsplat's."""
     log_every: int = 50
@@ -144,6 +148,8 @@ class TrainerConfig:
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
         shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
+        require_range("trainer", 0, 0.9, dropout=self.dropout)
+        require_range("trainer", 1, 10**9, dropout_views=self.dropout_views)
         require_range("trainer", 1e-4, 1e4, steps_scaler=self.steps_scaler)
         if self.means_steps is not None and self.means_steps < 1:
             raise ValueError(f"trainer: means_steps must be at least 1, got {self.means_steps}")
@@ -177,6 +183,15 @@ class TrainerConfig:
         """Share of the iterations, the last ones, whose mean a parameter takes in the end; of the Gaussians' by ``splats.`` and its name."""
         language = name.removeprefix("splats.") in _LANGUAGE
         return self.average_language if language else self.average_color
+
+    def dropout_at(self, step: int, views: int) -> float:
+        """Share of the Gaussians that an iteration leaves out, with so many training views: it grows over the run, and is 0 from `dropout_views` on.
+
+        Example:
+            >>> TrainerConfig(100, LearningRates(), dropout=0.25).dropout_at(50, 6)
+            0.1
+        """
+        return self.dropout * max(0.0, 1 - views / self.dropout_views) * step / self.iterations
 
     def is_half_size(self, step: int) -> bool:
         """Whether an iteration sees views at half their size."""

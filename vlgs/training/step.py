@@ -16,6 +16,7 @@ from vlgs.objectives import Setup, StepView
 from vlgs.objectives.objective import all_needs
 from vlgs.objectives.targets import Target, TrainingViews, covered
 from vlgs.training.cached_renders import CachedRenders, has_frozen_shape
+from vlgs.training.dropout import leave_out
 from vlgs.training.exposure import Exposure
 from vlgs.training.settings import TrainerConfig
 from vlgs.types import Camera
@@ -71,7 +72,7 @@ class TrainingStep:
         densify_on_color: Whether densification goes by the gradients of colour's objectives alone.
         exposure: A map of colour per photograph, or None.
         frozen: Renders from kept weights where shapes and weights are frozen, or None.
-        settings: Which iterations see views at half their size.
+        settings: Which iterations see views at half their size, and what share of the Gaussians they leave out.
     """
 
     model: SplatModel
@@ -110,7 +111,7 @@ class TrainingStep:
         pair = self.setup.views.sampler.pair(step)
         views = self.views(step)
         targets = (views[pair[0]], views[pair[1]])
-        fused = self.model.fuse()
+        fused = self._fuse(step)
         first, second = (
             self._exposed(index, self.render(index, target, fused))
             for index, target in zip(pair, targets, strict=True)
@@ -191,6 +192,14 @@ class TrainingStep:
     def _further(self) -> tuple[str, ...]:
         """Attributes beside colour and language that objectives need rendered."""
         return tuple(sorted(self.needs - {"color", "feature"}))
+
+    def _fuse(self, step: int) -> FusedGaussians:
+        """What the views of an iteration share; where no shape is learned it is all Gaussians, as what is kept of them."""
+        fused, sampler = self.model.fuse(), self.setup.views.sampler
+        share = self.settings.dropout_at(step, len(sampler.sizes))
+        if share == 0 or has_frozen_shape(self.model):
+            return fused
+        return leave_out(fused, share, sampler.dropout_rng(step))
 
     def _exposed(self, index: int, render: ViewRender) -> ViewRender:
         if self.exposure is None or render.color is None:

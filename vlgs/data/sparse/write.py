@@ -29,7 +29,7 @@ def write_colmap(folder: Path, model: SparseModel, text: bool = False) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"colmap: OUT must be a new or empty folder, got {folder}")
-    whole = _reread(model) if model.suffix in (".bin", ".txt") else _rebuild(model)
+    whole = reread(model) if model.suffix in (".bin", ".txt") else _rebuild(model)
     with new_folder(folder) as out:
         whole.write_text(str(out)) if text else whole.write(str(out))
         _require_written(out, ".txt" if text else ".bin", whole, folder)
@@ -56,7 +56,12 @@ def _require_written(out: Path, suffix: str, whole: Any, folder: Path) -> None:
         )
 
 
-def _reread(model: SparseModel) -> Any:
+def reread(model: SparseModel) -> Any:
+    """COLMAP's own `pycolmap.Reconstruction` of the files of a model, with its tracks.
+
+    Raises:
+        ValueError: If COLMAP refuses the tracks or rigs, or reads other images or points there.
+    """
     try:
         whole = import_pycolmap().Reconstruction(str(model.folder))
     except (ValueError, IndexError, RuntimeError) as error:  # what its C++ throws
