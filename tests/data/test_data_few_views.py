@@ -34,9 +34,15 @@ def test_few_train_and_what_only_others_saw_is_not_known(tmp_path: Path):
     np.testing.assert_array_equal(scene.points.numpy(), points[[2, 4, 5]])
     whole = load_scene(str(tmp_path))
     assert len(whole.points) == len(whole.point_colors) == 6
-    assert len({whole.fingerprint, scene.fingerprint}) == 2
     all_of_them = load_scene(str(tmp_path), train_views=7)
     assert stems_of(all_of_them) == stems_of(whole)
+
+
+def test_scenes_of_other_views_are_others_though_they_have_the_same_points(tmp_path: Path):
+    write_scene(tmp_path)
+    scenes = [load_scene(str(tmp_path), train_views=n) for n in (5, 6, None)]
+    assert [len(scene.points) for scene in scenes] == [6, 6, 6]
+    assert len({scene.fingerprint for scene in scenes}) == 3
 
 
 def test_masks_and_labels_are_those_of_the_views_that_are_left(tmp_path: Path):
