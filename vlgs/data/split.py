@@ -21,9 +21,8 @@ class Split:
     kind: str = "llff"
     test: tuple[str, ...] = ()
     every: int = 8
-    train_views: int | None = field(
-        default=None, repr=False
-    )  # whoever hashes a split says it apart
+    # Not in the repr, of which fingerprints are made that are older than it.
+    train_views: int | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -42,7 +41,7 @@ class Split:
 
     @property
     def name(self) -> str:
-        """The rule's name, which becomes part of the protocol's name."""
+        """The rule's name, which becomes part of the protocol's name: ``llff8``, or ``llff8-12`` with 12 `train_views`."""
         rule = f"llff{self.every}" if self.kind == "llff" else self.kind
         return rule if self.train_views is None else f"{rule}-{self.train_views}"
 

@@ -10,7 +10,7 @@ from vlgs.fields.splat import FusedGaussians
 
 
 def leave_out(fused: FusedGaussians, share: float, rng: np.random.Generator) -> FusedGaussians:
-    """Gaussians of which some have no weight, in colour and language, and the others so much more that the mean over draws is what it was.
+    """Gaussians of which some have no weight, in colour and language, and the others so much more, up to 1, that the mean over draws is what it was.
 
     After Park et al. 2025 (DropGaussian). Where few views look, each is easily explained by Gaussians before its own camera. With these left out now
     and then, what lies behind them has to be right by itself.
