@@ -8,13 +8,14 @@ import torch
 from test_training_fast import module_of, trained
 
 from vlgs.training.dropout import leave_out
+from vlgs.training.lightning import VLGSModule
 from vlgs.training.settings import LearningRates, TrainerConfig
 from vlgs.types import Scene
 
 SOME = ("trainer.iterations=6", "trainer.dropout=0.5", "trainer.dropout_views=100")
 
 
-def state(module) -> dict[str, torch.Tensor]:
+def state(module: VLGSModule) -> dict[str, torch.Tensor]:
     return {name: parameter.detach() for name, parameter in module.model.splats.items()}
 
 
@@ -32,7 +33,7 @@ def test_what_is_left_weighs_as_much_as_all_over_many_draws(tiny_scene: Scene):
     assert torch.equal(first.gaussians.opacities == 0, first.language_weight == 0)
 
 
-def test_a_weight_stays_below_one(tiny_scene: Scene):
+def test_no_weight_is_above_one(tiny_scene: Scene):
     fused = module_of(tiny_scene).model.fuse()
     fused.gaussians.opacities.data.fill_(0.95)
     left = leave_out(fused, 0.5, np.random.default_rng(0)).gaussians.opacities

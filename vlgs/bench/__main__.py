@@ -141,9 +141,7 @@ def unseen(parser: ArgumentParser) -> Runner:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--root", type=Path, help="folder of the scenes of photographs")
     parser.add_argument("--resize", type=float, default=0.5, help="of the photographs")
-    parser.add_argument(
-        "--splits", nargs="+", help="of them: every 8th, a tenth, 12 photographs; default: all"
-    )
+    parser.add_argument("--splits", nargs="+", help="of them; default: all of vlgs/bench/unseen.py")
     parser.add_argument("--recipe", default="default", help="a name for what --override changes")
     parser.add_argument("--override", nargs="+", default=[], metavar="KEY=VALUE")
     parser.add_argument("--beside", nargs="+", action="append", default=[], metavar=("NAME", "KEY=VALUE"), help="another recipe, trained in turns with the first; may be given again")  # fmt: skip

@@ -28,8 +28,9 @@ def seen_by(model: SparseModel, names: Set[str]) -> SparseModel:
     try:
         whole = reread(model)
     except ValueError as error:
-        what = "points must have been seen by its images, with data.train_views"
-        raise SceneError(Fault(str(model.file("points3D")), what, str(error))) from error
+        what = str(error).removeprefix("colmap: ")
+        advice = "data.train_views needs the tracks: write the model again with COLMAP, or train on all views"
+        raise SceneError(Fault(str(model.file("points3D")), what, advice)) from error
     ids = {image.image_id for image in model.images if image.name in names}
     tracks = [whole.point3D(int(point)).track.elements for point in model.point_ids]
     if not any(tracks):
