@@ -18,7 +18,7 @@ from vlgs.objectives import Setup
 from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
 from vlgs.training.exposure import Exposure
 from vlgs.training.means import Means
-from vlgs.training.settings import TrainerConfig
+from vlgs.training.settings import LANGUAGE, TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
 
 Rate = float | Mapping[str, float]
@@ -168,7 +168,8 @@ class VLGSModule(L.LightningModule):
                 row = self.model.attributes[group["name"]]
                 # A copy learns like its original (`vlgs.gaussians.attributes`).
                 name = row.start if isinstance(row.start, str) else row.name
-                group["lr"] = row.rate * self.settings.decay(name, step)
+                times = self.step.language_every if name in LANGUAGE else 1
+                group["lr"] = row.rate * self.settings.decay(name, step) * times
         highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.densifying.config.init is not None or "shN" in self.settings.freeze

@@ -10,7 +10,7 @@ from vlgs.values import require_range
 MOST_ITERATIONS = 10**9
 """Upper limit of `iterations`, far above any useful value."""
 
-_LANGUAGE = ("features", "indicator_logits")
+LANGUAGE = ("features", "indicator_logits")
 _COLOR = ("quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 SMALLEST_RATE = 1e-30
@@ -105,6 +105,9 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
+    language_every: int = 1
+    """Iterations from one that learns language to the next; those between learn colour alone. Its loss counts, and codes and indicators move, so many
+    times as much then. Where shapes are frozen, or there is no colour to learn, all learn language."""
     dropout: float = 0.0
     """Share of the Gaussians that the last iteration leaves out (`vlgs.training.dropout`), were there no view; others by `dropout_at`."""
     dropout_views: int = 30
@@ -148,6 +151,7 @@ class TrainerConfig:
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
         shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
+        require_range("trainer", 1, MOST_ITERATIONS, language_every=self.language_every)
         require_range("trainer", 0, 0.9, dropout=self.dropout)
         require_range("trainer", 1, 10**9, dropout_views=self.dropout_views)
         require_range("trainer", 1e-4, 1e4, steps_scaler=self.steps_scaler)
@@ -173,15 +177,13 @@ class TrainerConfig:
 
     def decay(self, name: str, step: int) -> float:
         """Factor of its rate that a parameter of the Gaussians has at a step: half a cosine over the run."""
-        end = (
-            self.language_decay if name in _LANGUAGE else self.color_decay if name in _COLOR else 1
-        )
+        end = self.language_decay if name in LANGUAGE else self.color_decay if name in _COLOR else 1
         fallen = (1 - math.cos(math.pi * min(step / self.iterations, 1.0))) / 2
         return (self.pace if name in _COLOR else 1) * (1 + (end - 1) * fallen)
 
     def average(self, name: str) -> float:
         """Share of the iterations, the last ones, whose mean a parameter takes in the end; of the Gaussians' by ``splats.`` and its name."""
-        language = name.removeprefix("splats.") in _LANGUAGE
+        language = name.removeprefix("splats.") in LANGUAGE
         return self.average_language if language else self.average_color
 
     def dropout_at(self, step: int, views: int) -> float:
