@@ -8,7 +8,7 @@ import torch
 from test_training_fast import module_of, trained
 
 from vlgs.training.lightning import VLGSModule
-from vlgs.training.settings import LANGUAGE, LearningRates, TrainerConfig
+from vlgs.training.settings import LearningRates, TrainerConfig
 from vlgs.types import Scene
 
 SECOND = "trainer.language_every=2"
@@ -40,14 +40,23 @@ def test_language_counts_as_much_on_the_mean_and_colour_as_ever(tiny_scene: Scen
         torch.testing.assert_close(thrice[name], term if name == "color" else 3 * term)
 
 
-def test_codes_and_indicators_go_as_far_in_fewer_iterations(tiny_scene: Scene):
+def test_what_language_alone_moves_goes_as_far_in_fewer_iterations(tiny_scene: Scene):
+    own = ("features", "indicator_logits", "language_log_scales", "language_quats")
     often, seldom = (
-        rates(module_of(tiny_scene, f"trainer.language_every={n}", "trainer.iterations=30"), 7)
+        rates(
+            module_of(
+                tiny_scene,
+                "sharing=pos",
+                "trainer.iterations=30",
+                f"trainer.language_every={n}",
+            ),
+            7,
+        )
         for n in (1, 3)
     )
-    assert often.keys() == seldom.keys() > set(LANGUAGE)
+    assert often.keys() == seldom.keys() > set(own)
     for name, rate in often.items():
-        assert seldom[name] == pytest.approx(3 * rate if name in LANGUAGE else rate), name
+        assert seldom[name] == pytest.approx(3 * rate if name in own else rate), name
 
 
 def test_between_two_of_them_no_language_moves(tiny_scene: Scene, tmp_path: Path):

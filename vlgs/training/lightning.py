@@ -12,13 +12,14 @@ from torch import Tensor, nn
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
+from vlgs.gaussians.attributes import THREE_DGS
 from vlgs.gaussians.ply import SH_COEFFICIENTS
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
 from vlgs.training.cached_renders import CachedRenders, freeze, has_frozen_shape
 from vlgs.training.exposure import Exposure
 from vlgs.training.means import Means
-from vlgs.training.settings import LANGUAGE, TrainerConfig
+from vlgs.training.settings import TrainerConfig
 from vlgs.training.step import StepReport, TrainingStep
 
 Rate = float | Mapping[str, float]
@@ -168,7 +169,7 @@ class VLGSModule(L.LightningModule):
                 row = self.model.attributes[group["name"]]
                 # A copy learns like its original (`vlgs.gaussians.attributes`).
                 name = row.start if isinstance(row.start, str) else row.name
-                times = self.step.language_every if name in LANGUAGE else 1
+                times = 1 if row.name in THREE_DGS else self.step.language_every
                 group["lr"] = row.rate * self.settings.decay(name, step) * times
         highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.

@@ -10,7 +10,7 @@ from vlgs.values import require_range
 MOST_ITERATIONS = 10**9
 """Upper limit of `iterations`, far above any useful value."""
 
-LANGUAGE = ("features", "indicator_logits")
+_LANGUAGE = ("features", "indicator_logits")
 _COLOR = ("quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 SMALLEST_RATE = 1e-30
@@ -106,8 +106,8 @@ class TrainerConfig:
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
     language_every: int = 1
-    """Iterations from one that learns language to the next; those between learn colour alone. Its loss counts, and codes and indicators move, so many
-    times as much then. Where shapes are frozen, or there is no colour to learn, all learn language."""
+    """Iterations from one that learns language to the next; those between learn colour alone. Its loss counts, and what colour does not use moves,
+    so many times as much then. Where shapes are frozen, or there is no colour to learn, all learn language."""
     dropout: float = 0.0
     """Share of the Gaussians that the last iteration leaves out (`vlgs.training.dropout`), were there no view; others by `dropout_at`."""
     dropout_views: int = 30
@@ -177,13 +177,15 @@ class TrainerConfig:
 
     def decay(self, name: str, step: int) -> float:
         """Factor of its rate that a parameter of the Gaussians has at a step: half a cosine over the run."""
-        end = self.language_decay if name in LANGUAGE else self.color_decay if name in _COLOR else 1
+        end = (
+            self.language_decay if name in _LANGUAGE else self.color_decay if name in _COLOR else 1
+        )
         fallen = (1 - math.cos(math.pi * min(step / self.iterations, 1.0))) / 2
         return (self.pace if name in _COLOR else 1) * (1 + (end - 1) * fallen)
 
     def average(self, name: str) -> float:
         """Share of the iterations, the last ones, whose mean a parameter takes in the end; of the Gaussians' by ``splats.`` and its name."""
-        language = name.removeprefix("splats.") in LANGUAGE
+        language = name.removeprefix("splats.") in _LANGUAGE
         return self.average_language if language else self.average_color
 
     def dropout_at(self, step: int, views: int) -> float:
