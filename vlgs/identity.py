@@ -123,7 +123,6 @@ AS_WITHOUT: Mapping[str, Any] = {
     "trainer.exposure": False,
     "trainer.half_size": 0,
     "trainer.language_decay": 1,
-    "trainer.language_every": 1,
     "trainer.learning_rates.exposure": 1e-3,
     "trainer.rates_for": None,
     "trainer.steps_scaler": 1,

@@ -56,7 +56,6 @@ LEVERS: dict[str, tuple[str, ...]] = {
         "trainer.rates_for=null",
         *(f"{_RATE}{name}={rate:g}" for name, rate in asdict(LearningRates()).items()),
     ),
-    "language in every iteration": ("trainer.language_every=1",),
     "twice the rates of language": (f"{_RATE}features=1e-2", f"{_RATE}indicator_logits=0.1"),
     "rates that stay": ("trainer.color_decay=1",),
     "positions that come to rest": (f"{_RATE}means_final=1.6e-6",),

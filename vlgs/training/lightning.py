@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from vlgs.fields.splat import SplatModel
 from vlgs.gaussians import DensifyState, GaussiansConfig
-from vlgs.gaussians.attributes import THREE_DGS
 from vlgs.gaussians.ply import SH_COEFFICIENTS
 from vlgs.geometry import camera_center, scene_extent
 from vlgs.objectives import Setup
@@ -169,8 +168,7 @@ class VLGSModule(L.LightningModule):
                 row = self.model.attributes[group["name"]]
                 # A copy learns like its original (`vlgs.gaussians.attributes`).
                 name = row.start if isinstance(row.start, str) else row.name
-                times = 1 if row.name in THREE_DGS else self.step.language_every
-                group["lr"] = row.rate * self.settings.decay(name, step) * times
+                group["lr"] = row.rate * self.settings.decay(name, step)
         highest = SH_COEFFICIENTS.index(self.model.splats["shN"].shape[1])
         # Gaussians that come trained, or whose harmonics stay as they are, have all their degrees from the start.
         trained = self.densifying.config.init is not None or "shN" in self.settings.freeze

@@ -105,9 +105,6 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
-    language_every: int = 1
-    """Iterations from one that learns language to the next; those between learn colour alone. Its loss counts, and what colour does not use moves,
-    so many times as much then. Where shapes are frozen, or there is no colour to learn, all learn language."""
     dropout: float = 0.0
     """Share of the Gaussians that the last iteration leaves out (`vlgs.training.dropout`), were there no view; others by `dropout_at`."""
     dropout_views: int = 30
@@ -151,7 +148,6 @@ class TrainerConfig:
         shares = {"language_decay": self.language_decay, "color_decay": self.color_decay}
         shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
-        require_range("trainer", 1, MOST_ITERATIONS, language_every=self.language_every)
         require_range("trainer", 0, 0.9, dropout=self.dropout)
         require_range("trainer", 1, 10**9, dropout_views=self.dropout_views)
         require_range("trainer", 1e-4, 1e4, steps_scaler=self.steps_scaler)

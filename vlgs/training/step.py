@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from vlgs.fields.splat import FusedGaussians, SplatModel, ViewRender
 from vlgs.losses import masked_mse
 from vlgs.objectives import Setup, StepView
-from vlgs.objectives.objective import Objective, all_needs
+from vlgs.objectives.objective import all_needs
 from vlgs.objectives.targets import Target, TrainingViews, covered
 from vlgs.training.cached_renders import CachedRenders, has_frozen_shape
 from vlgs.training.dropout import leave_out
@@ -103,22 +103,8 @@ class TrainingStep:
 
     @cached_property
     def needs(self) -> frozenset[str]:
-        """What is rendered of the real views, in iterations that learn everything."""
+        """What is rendered of the real views."""
         return all_needs(list(self.setup.objectives.values()))
-
-    @cached_property
-    def language_every(self) -> int:
-        """`TrainerConfig.language_every`; 1 where shapes are frozen, or there is no colour or nothing else to learn."""
-        of_color = [objective.needs == COLOR for objective in self.setup.objectives.values()]
-        both = any(of_color) and not all(of_color)
-        return self.settings.language_every if both and not has_frozen_shape(self.model) else 1
-
-    def objectives(self, step: int) -> list[Objective]:
-        """What an iteration is judged by: all objectives, or those of colour alone."""
-        every = list(self.setup.objectives.values())
-        if (step + 1) % self.language_every == 0:
-            return every
-        return [objective for objective in every if objective.needs == COLOR]
 
     def forward(self, step: int) -> Forward:
         """Render and judge; fusion runs once for all views."""
@@ -126,22 +112,18 @@ class TrainingStep:
         views = self.views(step)
         targets = (views[pair[0]], views[pair[1]])
         fused = self._fuse(step)
-        objectives = self.objectives(step)
-        needs = all_needs(objectives)
         first, second = (
-            self._exposed(index, self.render(index, target, fused, needs))
+            self._exposed(index, self.render(index, target, fused))
             for index, target in zip(pair, targets, strict=True)
         )
         again = partial(self.model.render, fused=fused)
         seen = StepView(step, pair, targets, (first, second), fused, again)
         terms: dict[str, Tensor] = {}
         of_color: list[Tensor] = []
-        for objective in objectives:
+        for objective in self.setup.objectives.values():
             own = objective(seen)
             if objective.needs == COLOR:
                 of_color += own.values()
-            elif self.language_every > 1:  # as much as in every iteration, on the mean
-                own = {name: self.language_every * term for name, term in own.items()}
             terms |= own
         return Forward(seen, _sum(terms.values()), _sum(of_color), terms)
 
@@ -163,12 +145,10 @@ class TrainingStep:
             for mean2d in screen
         )
 
-    def render(
-        self, index: int, target: Target, fused: FusedGaussians, needs: frozenset[str]
-    ) -> ViewRender:
+    def render(self, index: int, target: Target, fused: FusedGaussians) -> ViewRender:
         """A training view in all that is needed of it; a view without language in colour alone."""
-        color, further = "color" in needs, tuple(sorted(needs - {"color", "feature"}))
-        language = ("feature" in needs and target.has_language) or not (color or further)
+        color, further = "color" in self.needs, self._further
+        language = ("feature" in self.needs and target.has_language) or not (color or further)
         camera = target.view.camera
         if self.frozen is not None and not further:
             kept = self.frozen.render(index, camera, color, language, fused)
@@ -207,6 +187,11 @@ class TrainingStep:
             for name, part in named.items()
             if isinstance(part, nn.Module) and next(part.parameters(), None) is not None
         }
+
+    @cached_property
+    def _further(self) -> tuple[str, ...]:
+        """Attributes beside colour and language that objectives need rendered."""
+        return tuple(sorted(self.needs - {"color", "feature"}))
 
     def _fuse(self, step: int) -> FusedGaussians:
         """What the views of an iteration share; where no shape is learned it is all Gaussians, as what is kept of them."""
