@@ -34,7 +34,7 @@ _REFUSED_FLAGS = {
 }
 
 
-def check_command(arguments: Sequence[str], name: str = "config") -> None:
+def check_command(arguments: Sequence[str], name: str = "config") -> DictConfig | None:
     """Refuse a command line with mistakes, or one that would run foreign code before the task begins.
 
     ``--help`` prints the manual, or with options (``data=colmap``) the keys of these, and exits.
@@ -43,10 +43,14 @@ def check_command(arguments: Sequence[str], name: str = "config") -> None:
         arguments: Without the program.
         name: Of the primary file in `conf`.
 
+    Returns:
+        The configuration with Hydra's part, where one run is asked for and nothing else of Hydra (`vlgs.task.run_task`); else None.
+
     Raises:
         ValueError: Names the argument, and what could have been meant.
     """
-    given = get_args_parser().parse_args(list(arguments))
+    parser = get_args_parser()
+    given = parser.parse_args(list(arguments))
     for flag, why in _REFUSED_FLAGS.items():
         if getattr(given, flag):
             raise ValueError(f"command: {why}, got {getattr(given, flag)}")
@@ -68,13 +72,16 @@ def check_command(arguments: Sequence[str], name: str = "config") -> None:
             print(_manual(_compose(given.overrides, name, extra, hydra=True), extra, given.resolve))
         sys.exit(0)
     if given.hydra_help or given.shell_completion:
-        return
+        return None
+    config = None
     for job in _jobs(overrides):
         config = _compose(job, name, extra, hydra=True)
         check_hydra(_plain(config.hydra))
         _check_plugins(config, overrides)
         own = [str(key) for key in config if key != "hydra"]
         check_targets(OmegaConf.masked_copy(config, own), name)
+    is_plain = vars(given) == vars(parser.parse_args(given.overrides))
+    return config if is_plain and config is not None and config.hydra.mode is None else None
 
 
 def composed(overrides: Sequence[str], name: str = "config") -> DictConfig:
@@ -197,7 +204,7 @@ def _compose(overrides: Sequence[str], name: str, extra: Path | None, hydra: boo
     """Compose a command line; an error suggests what was meant."""
     path = [f"hydra.searchpath=[file://{extra}]"] if extra else []
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
+        with initialize_config_dir(str(CONF), job_name="run", version_base="1.3"):
             return compose(name, overrides=[*path, *overrides], return_hydra_config=hydra)
     except (
         HydraException,

@@ -20,6 +20,7 @@ from vlgs.imports import uncollected
 from vlgs.places import tidy_sweep, write_config
 from vlgs.runs import BUSY, STOPPED, UNSCORED, RunFolder
 from vlgs.tables.multirun import note_run
+from vlgs.task import run_task
 from vlgs.text import screen
 
 if TYPE_CHECKING:
@@ -50,7 +51,10 @@ def command() -> None:
     """The command line, from reading it to the exit status."""
     with _errors_in_a_line():
         take_command_line()
-        check_command(sys.argv[1:])
+        composed = check_command(sys.argv[1:])
+        if composed is not None:
+            run_task(main, composed)
+            return
         several = {"-m", "--multirun"} & set(sys.argv)
         with _whole_errors() if several else nullcontext():
             main()
