@@ -10,6 +10,7 @@ import pytest
 import torch
 from slow import with_slow
 from tiny_runs import TINY, composed
+from torch import Tensor
 
 from vlgs.config import instantiate
 from vlgs.experiment import construct
@@ -20,6 +21,8 @@ from vlgs.training.fit import FitOptions, fit
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.settings import LearningRates, TrainerConfig
 from vlgs.types import Scene
+
+CODES = "gaussians.init_features=normal"
 
 LESS = (
     "trainer.iterations=16",
@@ -197,9 +200,49 @@ def test_a_scaled_budget_is_what_is_trained(tiny_scene: Scene):
     assert not module.settings.is_half_size(4)
 
 
+def test_training_views_are_blended_to_an_earlier_stop_and_results_are_not(tiny_scene: Scene):
+    dense = (*LESS, "gaussians.init_opacity=0.6", "gaussians.init_indicator=0.6", CODES)
+    module = module_of(tiny_scene, *dense, "trainer.transmittance_min=0.05")
+    whole, target = module_of(tiny_scene, *dense), module.views[0]
+    fused = module.model.fuse()
+
+    def at(least: float, color: bool) -> Tensor:
+        raster = replace(module.model.raster, transmittance_min=least)
+        render = module.model.render(target.view.camera, color=color, fused=fused, raster=raster)
+        image = render.color if color else render.feature
+        assert image is not None
+        return image.detach()
+
+    again = module.step.forward(0).seen.render(target.view.camera, color=False)
+    given = module.step.render(0, target, fused)
+    for render, color in ((given.color, True), (again.feature, False)):
+        assert render is not None
+        assert torch.equal(render, at(0.05, color))
+        lost = float((render.detach() - at(1e-4, color)).abs().max())
+        assert lost > 0
+        assert not color or lost <= 0.05  # times colours, which are at most 1
+    assert module.model.raster == whole.model.raster
+    ends = whole.model.render(target.view.camera).color
+    assert ends is not None
+    assert torch.equal(at(1e-4, color=True), ends)
+
+
+def test_a_stop_that_is_earlier_in_every_picture_stays(tiny_scene: Scene):
+    given = ("raster=fast", "trainer.transmittance_min=0.001", "gaussians.init_opacity=0.6")
+    module = module_of(tiny_scene, *LESS, *given)
+    camera = module.views[0].view.camera
+    render = module.step.render(0, module.views[0], module.model.fuse()).color
+    whole = module.model.render(camera).color
+    assert render is not None
+    assert whole is not None
+    assert torch.equal(render, whole)
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [
+        ("transmittance_min", -0.1),
+        ("transmittance_min", 0.2),
         ("color_decay", 1.5),
         ("rates_for", 0),
         ("half_size", -0.1),

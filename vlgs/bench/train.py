@@ -67,6 +67,8 @@ LEVERS: dict[str, tuple[str, ...]] = {
         "gaussians.densify.by_error=false",
     ),
     "what no view shows stays": ("gaussians.densify.prune_unseen=0",),
+    "every pixel is asked what it shows": ("gaussians.densify.prune_views=0",),
+    "what little light is left counts": ("trainer.transmittance_min=0",),
 }
 """What ``trainer=fast`` is without one of its parts, or with language that learns faster."""
 

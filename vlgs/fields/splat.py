@@ -119,6 +119,7 @@ class SplatModel(nn.Module):
         language: bool = True,
         fused: FusedGaussians | None = None,
         further: Sequence[str] = (),
+        raster: RasterConfig | None = None,
     ) -> ViewRender:
         """Render colour, language and further attributes in one pass over the tiles.
 
@@ -128,6 +129,7 @@ class SplatModel(nn.Module):
             language: Whether language is wanted.
             fused: Result of `fuse`, when several views share it.
             further: Names of further attributes that are wanted (``gaussians.attributes``).
+            raster: In place of the model's own constants.
 
         Raises:
             ValueError: If nothing is wanted, a further attribute cannot be drawn, or a Gaussian is not finite.
@@ -148,7 +150,7 @@ class SplatModel(nn.Module):
             groups += _language_groups(feature, fused, shape_grad)
         before = len(groups)
         groups += [self._group(name, fused) for name in further]
-        out = self._rasterize(fused.gaussians, groups, camera)
+        out = self._rasterize(fused.gaussians, groups, camera, raster or self.raster)
         seen, alpha = out.images[before - 1], out.alphas[before - 1]
         if language and fused.language_weight.dim() == 2:
             levels = fused.language_weight.shape[1]
@@ -204,7 +206,7 @@ class SplatModel(nn.Module):
         gaussians = self.gaussians()
         shape = None if of_color else gaussians.language_shape
         group = ChannelGroup(values, weight, shape=shape)
-        return self._rasterize(gaussians, [group], camera, step).images[0]
+        return self._rasterize(gaussians, [group], camera, self.raster_of(step)).images[0]
 
     def raster_of(self, step: int) -> RasterConfig:
         """The constants for every `step`-th pixel of an image: `RasterConfig.eps2d` is in pixels."""
@@ -238,7 +240,11 @@ class SplatModel(nn.Module):
         return color.clamp_min(0.0), feature
 
     def _rasterize(
-        self, gaussians: Gaussians, groups: list[ChannelGroup], camera: Camera, step: int = 1
+        self,
+        gaussians: Gaussians,
+        groups: list[ChannelGroup],
+        camera: Camera,
+        raster: RasterConfig,
     ):
         return rasterize(
             gaussians.means,
@@ -249,7 +255,7 @@ class SplatModel(nn.Module):
             camera.K,
             camera.width,
             camera.height,
-            config=self.raster_of(step),
+            config=raster,
         )
 
 

@@ -105,6 +105,9 @@ class TrainerConfig:
     half_size: float = 0.0
     """Share of the iterations, from the first, that see the training views at half their width and height (`vlgs.data.half_size`). Where shapes
     are frozen none do."""
+    transmittance_min: float = 0.0
+    """What lies behind so little of a pixel's light is not blended in an iteration, where that is more than `RasterConfig.transmittance_min`: what is
+    rendered then is off by at most this times the largest value. Where shapes are frozen it does not count."""
     dropout: float = 0.0
     """Share of the Gaussians that the last iteration leaves out (`vlgs.training.dropout`), were there no view; others by `dropout_at`."""
     dropout_views: int = 30
@@ -149,6 +152,7 @@ class TrainerConfig:
         shares |= {"average_language": self.average_language, "average_color": self.average_color}
         require_range("trainer", 0, 1, **shares, half_size=self.half_size)
         require_range("trainer", 0, 0.9, dropout=self.dropout)
+        require_range("trainer", 0, 0.1, transmittance_min=self.transmittance_min)
         require_range("trainer", 1, 10**9, dropout_views=self.dropout_views)
         require_range("trainer", 1e-4, 1e4, steps_scaler=self.steps_scaler)
         if self.means_steps is not None and self.means_steps < 1:

@@ -19,7 +19,7 @@ from vlgs.training.cached_renders import CachedRenders, has_frozen_shape
 from vlgs.training.dropout import leave_out
 from vlgs.training.exposure import Exposure
 from vlgs.training.settings import TrainerConfig
-from vlgs.types import Camera
+from vlgs.types import Camera, RasterConfig
 
 COLOR = frozenset({"color"})
 
@@ -72,7 +72,7 @@ class TrainingStep:
         densify_on_color: Whether densification goes by the gradients of colour's objectives alone.
         exposure: A map of colour per photograph, or None.
         frozen: Renders from kept weights where shapes and weights are frozen, or None.
-        settings: Which iterations see views at half their size, and what share of the Gaussians they leave out.
+        settings: Which iterations see views at half their size, what share of the Gaussians they leave out, and where they stop to blend.
     """
 
     model: SplatModel
@@ -116,7 +116,7 @@ class TrainingStep:
             self._exposed(index, self.render(index, target, fused))
             for index, target in zip(pair, targets, strict=True)
         )
-        again = partial(self.model.render, fused=fused)
+        again = partial(self.model.render, fused=fused, raster=self._raster)
         seen = StepView(step, pair, targets, (first, second), fused, again)
         terms: dict[str, Tensor] = {}
         of_color: list[Tensor] = []
@@ -154,7 +154,7 @@ class TrainingStep:
             kept = self.frozen.render(index, camera, color, language, fused)
             if kept is not None:
                 return kept
-        render = self.model.render(camera, color, language, fused, further)
+        render = self.model.render(camera, color, language, fused, further, self._raster)
         if render.mean2d.requires_grad:
             render.mean2d.retain_grad()
         return render
@@ -187,6 +187,13 @@ class TrainingStep:
             for name, part in named.items()
             if isinstance(part, nn.Module) and next(part.parameters(), None) is not None
         }
+
+    @cached_property
+    def _raster(self) -> RasterConfig:
+        """The constants of the model, or an earlier stop."""
+        raster = self.model.raster
+        least = max(raster.transmittance_min, self.settings.transmittance_min)
+        return replace(raster, transmittance_min=least)
 
     @cached_property
     def _further(self) -> tuple[str, ...]:
