@@ -69,6 +69,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
     "what no view shows stays": ("gaussians.densify.prune_unseen=0",),
     "every pixel is asked what it shows": ("gaussians.densify.prune_views=0",),
     "what little light is left counts": ("trainer.transmittance_min=0",),
+    "every blended view": ("trainer.skip.blend_reuse=0",),
 }
 """What ``trainer=fast`` is without one of its parts, or with language that learns faster."""
 
