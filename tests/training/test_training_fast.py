@@ -238,6 +238,18 @@ def test_a_stop_that_is_earlier_in_every_picture_stays(tiny_scene: Scene):
     assert torch.equal(render, whole)
 
 
+def test_where_no_shape_is_learned_the_stop_is_that_of_kept_weights(tiny_scene: Scene):
+    frozen = "trainer.freeze=[means,quats,log_scales,sh0,shN,opacity_logits,indicator_logits]"
+    given = (*LESS, "gaussians.densify.stop=0", "fusion=none", frozen, CODES)
+    dense = ("gaussians.init_indicator=0.6", "trainer.transmittance_min=0.1", "blend=none")
+    kept = module_of(tiny_scene, *given, *dense)
+    rendered = module_of(tiny_scene, *given, *dense, "trainer.skip.frozen_weights=false")
+    one, other = (m.step.forward(0).seen.renders[0].feature for m in (kept, rendered))
+    assert one is not None
+    assert other is not None
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [

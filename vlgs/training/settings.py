@@ -107,7 +107,7 @@ class TrainerConfig:
     are frozen none do."""
     transmittance_min: float = 0.0
     """What lies behind so little of a pixel's light is not blended in an iteration, where that is more than `RasterConfig.transmittance_min`: what is
-    rendered then is off by at most this times the largest value. Where shapes are frozen it does not count."""
+    rendered then is off by as much as `vlgs.skips` says of its `early_stop`. Where shapes are frozen it does not count, as with `half_size`."""
     dropout: float = 0.0
     """Share of the Gaussians that the last iteration leaves out (`vlgs.training.dropout`), were there no view; others by `dropout_at`."""
     dropout_views: int = 30

@@ -190,8 +190,10 @@ class TrainingStep:
 
     @cached_property
     def _raster(self) -> RasterConfig:
-        """The constants of the model, or an earlier stop."""
+        """The constants of the model, or an earlier stop; where shapes are frozen those of the model, as kept weights have them."""
         raster = self.model.raster
+        if has_frozen_shape(self.model):
+            return raster
         least = max(raster.transmittance_min, self.settings.transmittance_min)
         return replace(raster, transmittance_min=least)
 
