@@ -101,7 +101,6 @@ AS_WITHOUT: Mapping[str, Any] = {
     "gaussians.densify.by_error": False,
     "gaussians.densify.long_axis": False,
     "gaussians.densify.prune_unseen": 0,
-    "gaussians.densify.prune_views": 0,
     "gaussians.densify.grad_threshold_size": 0,
     "head.training.draws": 1,
     "head.training.spread": 0,

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from math import isqrt
 from pathlib import Path
 
 import pytest
@@ -103,25 +102,6 @@ def test_many_pixels_are_sampled(tiny_scene: Scene, monkeypatch: pytest.MonkeyPa
     torch.testing.assert_close(sampled[large], whole[large], rtol=0.2, atol=0)
 
 
-def test_many_views_are_sampled_where_the_recipe_says_so(
-    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
-):
-    many = len(tiny_scene.train)
-    whole = most_shown(module_of(tiny_scene))
-    steps: list[int] = []
-    original = module_under_test.subsample_camera
-    monkeypatch.setattr(
-        module_under_test,
-        "subsample_camera",
-        lambda camera, step: steps.append(step) or original(camera, step),
-    )
-    for views, step in ((0, 1), (1, isqrt(many)), (many // 4 + 1, 1), (many // 4, 2)):
-        steps.clear()
-        shown = most_shown(module_of(tiny_scene, f"gaussians.densify.prune_views={views}"))
-        assert set(steps) == {step}, views
-        assert torch.equal(shown, whole) == (step == 1)
-
-
 def test_pixels_that_a_photograph_does_not_cover_do_not_count(tiny_scene: Scene):
     views = [
         replace(v, read_valid=lambda v=v: torch.arange(v.camera.width).expand(v.camera.height, -1) < 10)
@@ -177,5 +157,3 @@ def test_a_scene_does_not_end_empty(tiny_scene: Scene, tmp_path: Path):
 def test_a_bound_below_nothing_is_refused():
     with pytest.raises(ValueError, match=r"densify: prune_unseen must be .*, got -1"):
         DensifyConfig(prune_unseen=-1.0)
-    with pytest.raises(ValueError, match=r"densify: prune_views must be .*, got -1"):
-        DensifyConfig(prune_views=-1)

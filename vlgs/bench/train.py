@@ -67,7 +67,6 @@ LEVERS: dict[str, tuple[str, ...]] = {
         "gaussians.densify.by_error=false",
     ),
     "what no view shows stays": ("gaussians.densify.prune_unseen=0",),
-    "every pixel is asked what it shows": ("gaussians.densify.prune_views=0",),
     "what little light is left counts": ("trainer.transmittance_min=0",),
     "every blended view": ("trainer.skip.blend_reuse=0",),
 }

@@ -36,8 +36,6 @@ class DensifyConfig:
     prune_unseen: float = 0.0
     """When densification ends, a Gaussian that fills fewer pixels than this in every training view, by the sum of its blending weights, is removed
     (`vlgs.training.most_shown`); 0: none is. With `prune_on` as in `prune_below`."""
-    prune_views: int = 0
-    """`prune_unseen` looks at as many pixels as so many views have, every n-th of every n-th row of each, where there are more views; 0: at all."""
     prune_large: bool = True
     """Whether Gaussians above `max_scale_share` are removed, once the first opacity reset has passed."""
     max_scale_share: float = 0.1
@@ -61,7 +59,7 @@ class DensifyConfig:
     def __post_init__(self) -> None:
         _require_at_least("densify", 1, every=self.every)
         _require_at_least("densify", 0, start=self.start, stop=self.stop)
-        _require_at_least("densify", 0, reset_every=self.reset_every, prune_views=self.prune_views)
+        _require_at_least("densify", 0, reset_every=self.reset_every)
         _require_positive(
             "densify",
             grad_threshold=self.grad_threshold,

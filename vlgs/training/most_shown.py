@@ -5,8 +5,7 @@ whose largest weight in any pixel is small; here those go that fill less than a 
 (`vlgs.gaussians.DensifyConfig.prune_unseen`), whatever their opacity.
 """
 
-from collections.abc import Sequence
-from math import ceil, isqrt, sqrt
+from math import ceil, sqrt
 
 import torch
 from jaxtyping import Float
@@ -16,10 +15,10 @@ from vlgs.geometry import subsample_camera
 from vlgs.objectives.targets import covered
 from vlgs.training.lift import gathered
 from vlgs.training.lightning import VLGSModule
-from vlgs.types import View
 
 PIXELS = 1 << 24
-"""Most that are looked at in all views together."""
+"""Most that are looked at in all views together. Larger ones are sampled, every n-th pixel of every n-th row of each view: the more views there
+are, the more often the samples of one meet what those of another miss."""
 
 
 @torch.no_grad()
@@ -27,18 +26,18 @@ def most_shown(module: VLGSModule) -> Float[Tensor, " n"]:
     """Per Gaussian, of the training view that shows most of it, the sum of its blending weights over pixels: how many pixels it fills.
 
     Weights are those that keep a Gaussian alive (`vlgs.gaussians.GaussiansConfig.prune_on`): of colour, of language, or whichever shows more.
-    Pixels that a photograph does not cover do not count. Where there are many views they are sampled, every n-th pixel of every n-th row
-    (`vlgs.gaussians.DensifyConfig.prune_views`): the samples of one meet what those of another miss.
+    Pixels that a photograph does not cover do not count.
     """
     model, views = module.model, module.views.scene.train
-    fused, config = model.fuse(), module.densifying.config
+    fused, prune_on = model.fuse(), module.densifying.config.prune_on
     weights: list[tuple[Tensor, bool]] = []
-    if config.prune_on != "indicator":
+    if prune_on != "indicator":
         weights.append((fused.gaussians.opacities, True))
-    if config.prune_on != "opacity":
+    if prune_on != "opacity":
         levels = fused.language_weight.view(model.count, -1).T.contiguous()
         weights += [(weight, False) for weight in levels]
-    step = _step(views, config.densify.prune_views)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    step = max(1, ceil(sqrt(pixels / PIXELS)))
     most = torch.zeros(model.count)
     for view in views:
         camera, seen = subsample_camera(view.camera, step), covered(view)
@@ -49,9 +48,3 @@ def most_shown(module: VLGSModule) -> Float[Tensor, " n"]:
             shown = gathered(model, camera, weight, image, of_color, step)
             most = most.maximum(shown[:, 0])
     return most * step**2
-
-
-def _step(views: Sequence[View], prune_views: int) -> int:
-    pixels = sum(view.camera.width * view.camera.height for view in views)
-    by_views = isqrt(len(views) // prune_views) if prune_views else 1
-    return max(1, by_views, ceil(sqrt(pixels / PIXELS)))
