@@ -17,6 +17,7 @@ from vlgs.runs import RunFolder
 from vlgs.training import most_shown as module_under_test
 from vlgs.training.build import Parts, build_module
 from vlgs.training.fit import FitOptions, fit
+from vlgs.training.lift import gathered, gathered_each
 from vlgs.training.lightning import VLGSModule
 from vlgs.training.most_shown import most_shown
 from vlgs.types import Scene
@@ -77,6 +78,25 @@ def test_it_is_the_most_of_all_views_and_of_colour_and_language(tiny_scene: Scen
         want = torch.stack([image.sum() for image in images]).max()
         torch.testing.assert_close(shown[row], want, rtol=1e-4, atol=1e-5)
     assert shown.count_nonzero() > 100
+
+
+@pytest.mark.parametrize("sharing", ["pos_cov", "pos"])
+def test_colour_and_language_in_one_pass_are_what_they_are_alone(tiny_scene: Scene, sharing: str):
+    module = module_of(tiny_scene, f"sharing={sharing}", "gaussians.init_indicator=0.3")
+    model, camera = module.model, tiny_scene.train[0].camera
+    if "language_log_scales" in model.splats:
+        with torch.no_grad():
+            model.splats["language_log_scales"] += 0.5
+    fused, image = model.fuse(), torch.rand(camera.height, camera.width, 2)
+    image[..., 1] = 1
+    weights = [(fused.gaussians.opacities, True), (fused.language_weight, False)]
+    both = gathered_each(model, camera, weights, image)
+    view = model.render(camera, fused=fused)
+    drawn = (view.alpha_color, view.alpha_language)
+    for (weight, of_color), together, alpha in zip(weights, both, drawn, strict=True):
+        assert torch.equal(gathered(model, camera, weight, image, of_color), together)
+        assert alpha is not None
+        torch.testing.assert_close(together[:, 1].sum(), alpha.detach().sum(), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("prune_on", ["opacity", "indicator"])

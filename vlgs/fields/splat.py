@@ -203,10 +203,21 @@ class SplatModel(nn.Module):
                 image, but for Gaussians that `RasterConfig.fov_margin` clamps, as that depends on the image.
             of_color: In the shapes of colour instead.
         """
+        return self.render_each(camera, [(values, weight, of_color)], step)[0]
+
+    def render_each(
+        self,
+        camera: Camera,
+        groups: Sequence[tuple[Float[Tensor, "n c"], Float[Tensor, " n"], bool]],
+        step: int = 1,
+    ) -> tuple[Float[Tensor, "h w c"], ...]:
+        """Likewise for values, weight and `of_color` of several, in one pass over the tiles where they have one shape."""
         gaussians = self.gaussians()
-        shape = None if of_color else gaussians.language_shape
-        group = ChannelGroup(values, weight, shape=shape)
-        return self._rasterize(gaussians, [group], camera, self.raster_of(step)).images[0]
+        drawn = [
+            ChannelGroup(values, weight, shape=None if of_color else gaussians.language_shape)
+            for values, weight, of_color in groups
+        ]
+        return self._rasterize(gaussians, drawn, camera, self.raster_of(step)).images
 
     def raster_of(self, step: int) -> RasterConfig:
         """The constants for every `step`-th pixel of an image: `RasterConfig.eps2d` is in pixels."""

@@ -1,5 +1,7 @@
 """Language codes lifted from the training views onto Gaussians, without training."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -55,10 +57,23 @@ def gathered(
         of_color: In the shapes of colour, not of language.
         step: Of the camera, where it is every `step`-th pixel of another (`SplatModel.render_values`).
     """
-    values = weight.new_zeros(len(weight), image.shape[-1], requires_grad=True)
+    return gathered_each(model, camera, [(weight, of_color)], image, step)[0]
+
+
+def gathered_each(
+    model: SplatModel,
+    camera: Camera,
+    weights: Sequence[tuple[Float[Tensor, " n"], bool]],
+    image: Float[Tensor, "h w c"],
+    step: int = 1,
+) -> tuple[Float[Tensor, "n c"], ...]:
+    """Likewise for several weights, each with its `of_color`."""
+    values = [own.new_zeros(len(own), image.shape[-1], requires_grad=True) for own, _ in weights]
     with torch.enable_grad():
-        rendered = model.render_values(camera, values, weight, step, of_color)
-    return sums_back(rendered, values, image)
+        groups = [(one, *own) for one, own in zip(values, weights, strict=True)]
+        rendered = model.render_each(camera, groups, step)
+        total = torch.stack([(one * image).sum() for one in rendered]).sum()
+    return torch.autograd.grad(total, values)
 
 
 def sums_back(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vlgs.geometry import subsample_camera
 from vlgs.objectives.targets import covered
-from vlgs.training.lift import gathered
+from vlgs.training.lift import gathered_each
 from vlgs.training.lightning import VLGSModule
 
 PIXELS = 1 << 24
@@ -44,7 +44,6 @@ def most_shown(module: VLGSModule) -> Float[Tensor, " n"]:
         image = torch.ones(camera.height, camera.width, 1)
         if seen is not None:
             image *= seen[::step, ::step, None]
-        for weight, of_color in weights:
-            shown = gathered(model, camera, weight, image, of_color, step)
+        for shown in gathered_each(model, camera, weights, image, step):
             most = most.maximum(shown[:, 0])
     return most * step**2
