@@ -251,6 +251,15 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "vlgs.fields.splat.SplatModel.render_values": lambda: model(
         lambda m: m.render_values(view(), m.splats["features"], m.gaussians().indicators)
     ),
+    "vlgs.fields.splat.SplatModel.render_each": lambda: model(
+        lambda m: m.render_each(
+            view(),
+            [
+                (m.splats["features"], m.gaussians().indicators, False),
+                (m.splats["sh0"], m.gaussians().opacities, True),
+            ],
+        )
+    ),
     "vlgs.ops.attention.attend": lambda: (
         lambda color, feature, *layers: attend(color, feature, Token(1, 2), layers, True),
         [draw(3, 2), draw(3, 1, seed=1), *(draw(*s, seed=i) for i, s in enumerate(LAYERS))],
