@@ -72,6 +72,7 @@ def gathered_each(
     with torch.enable_grad():
         groups = [(one, *own) for one, own in zip(values, weights, strict=True)]
         rendered = model.render_each(camera, groups, step)
+        # The gradient of one number, for the reason that `sums_back` gives.
         total = torch.stack([(one * image).sum() for one in rendered]).sum()
     return torch.autograd.grad(total, values)
 
